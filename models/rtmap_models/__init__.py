@@ -1,0 +1,1 @@
+"""The network of rtmap: torch modules, training and the export to ONNX."""

@@ -1,0 +1,1 @@
+"""Poses, polylines, Chamfer distances, matching, cameras: pure functions on numpy arrays."""

@@ -1,0 +1,1 @@
+"""The map: elements, their CRS, immutable GeoParquet tiles and versions."""

@@ -1,0 +1,1 @@
+"""The mission, one room per verb: pure functions on arrays and tables."""

@@ -1,0 +1,1 @@
+"""From observations to events: what is gone, new or confirmed."""

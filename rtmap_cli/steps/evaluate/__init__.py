@@ -1,0 +1,1 @@
+"""The metrics of the field, exactly: map AP, poses, changes."""

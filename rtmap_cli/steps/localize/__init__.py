@@ -1,0 +1,1 @@
+"""Where each frame stands on the prior map, and how sure (Eq. 4)."""

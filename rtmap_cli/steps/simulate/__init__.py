@@ -1,0 +1,1 @@
+"""Simulated worlds, drives, images, observations and changes, all seeded."""

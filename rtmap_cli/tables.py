@@ -1,0 +1,167 @@
+"""Parquet and JSON files that state what they are, and that appear whole or not at all.
+
+Every table carries ``rtmap.schema`` (its name) and ``rtmap.schema_version`` ("major.minor") in
+the Arrow schema metadata, with ``rtmap.frame`` and ``rtmap.units`` where geometry is involved.
+Readers refuse an unknown major version.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from rtmap_cli.errors import BadInput
+
+
+@dataclass(frozen=True)
+class TableSchema:
+    """Name, version and columns of one kind of Parquet file."""
+
+    name: str
+    version: str
+    columns: pa.Schema
+    frame: str = ""
+    units: str = ""
+    description: str = ""
+
+    def metadata(self, extra: dict[str, str] | None = None) -> dict[str, str]:
+        """The metadata written into the file."""
+        base = {"rtmap.schema": self.name, "rtmap.schema_version": self.version}
+        if self.frame:
+            base["rtmap.frame"] = self.frame
+        if self.units:
+            base["rtmap.units"] = self.units
+        return base | (extra or {})
+
+
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside ``path`` that replaces it when the block ends without an error."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
+    """A temporary folder beside ``path`` that becomes it when the block ends without an error."""
+    import shutil
+
+    path = Path(path)
+    if path.exists() and not overwrite and (not path.is_dir() or any(path.iterdir())):
+        raise BadInput(path, "exists already", "choose another output or pass --overwrite")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        yield temporary
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o777 & ~umask)
+        if path.exists():
+            retired = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
+            path.replace(retired / "old")
+            temporary.replace(path)
+            shutil.rmtree(retired)
+        else:
+            temporary.replace(path)
+    finally:
+        if temporary.exists():
+            shutil.rmtree(temporary)
+
+
+def write_table(
+    table: pa.Table, path: str | Path, schema: TableSchema, extra: dict[str, str] | None = None
+) -> None:
+    """Write one Parquet file with its schema's name and version; same table → same bytes."""
+    merged = schema.columns.with_metadata(schema.metadata(extra))
+    table = table.select(schema.columns.names).cast(schema.columns)
+    with whole_file(path) as temporary:
+        pq.write_table(
+            table.replace_schema_metadata(merged.metadata), temporary, compression="zstd"
+        )
+
+
+def check_schema(
+    metadata: dict[bytes, bytes] | None, path: str | Path, schema: TableSchema
+) -> None:
+    """Raise BadInput unless the metadata names ``schema`` in a major version that we know."""
+    found = {k.decode(): v.decode(errors="replace") for k, v in (metadata or {}).items()}
+    name = found.get("rtmap.schema")
+    if name is None:
+        raise BadInput(path, "not an rtmap file (no rtmap.schema in its metadata)")
+    if name != schema.name:
+        raise BadInput(path, f"holds {name}, expected {schema.name}")
+    version = found.get("rtmap.schema_version", "?")
+    if version.split(".")[0] != schema.version.split(".")[0]:
+        raise BadInput(
+            path,
+            f"{name} version {version} is unknown to this rtmap (it reads {schema.version})",
+            "use the rtmap that wrote it, or a newer one",
+        )
+
+
+def read_table(path: str | Path, schema: TableSchema) -> pa.Table:
+    """Read one Parquet file, checked against ``schema``; BadInput when it cannot be trusted."""
+    path = Path(path)
+    if not path.exists():
+        raise BadInput(path, "no such file")
+    try:
+        table = pq.read_table(path, partitioning=None)
+    except (pa.ArrowException, OSError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise BadInput(
+            path, f"cannot be read as Parquet ({first})", "it may be truncated; copy it again"
+        ) from None
+    check_schema(table.schema.metadata, path, schema)
+    missing = [n for n in schema.columns.names if n not in table.schema.names]
+    if missing:
+        raise BadInput(path, f"column {', '.join(missing)} is missing")
+    return table
+
+
+def table_metadata(table: pa.Table) -> dict[str, str]:
+    """The metadata of a table as text."""
+    return {k.decode(): v.decode() for k, v in (table.schema.metadata or {}).items()}
+
+
+def write_json(value: Any, path: str | Path) -> None:
+    """Write JSON with sorted keys, whole or not at all."""
+    text = json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def read_json(path: str | Path) -> Any:
+    """Read a JSON file (``.gz`` allowed); BadInput when missing or broken."""
+    import gzip
+    import zlib
+
+    path = Path(path)
+    if not path.exists():
+        raise BadInput(path, "no such file")
+    try:
+        if path.suffix == ".gz":
+            with gzip.open(path, "rt", encoding="utf-8") as file:
+                return json.load(file)
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError, EOFError, zlib.error) as error:
+        raise BadInput(path, f"cannot be read as JSON ({error})") from None
