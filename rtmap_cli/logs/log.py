@@ -77,12 +77,17 @@ class Frame:
 
 
 class Log(Protocol):
-    """What every reader of logs offers; frames come lazily and in time order."""
+    """What every reader of logs offers; frames come lazily and in time order.
+
+    ``ground_z`` is the ego-frame height of the road under the vehicle, metres (0 when the ego
+    origin lies on the road, about -0.32 on an Argoverse 2 vehicle).
+    """
 
     log_id: str
     crs: str
     rig: Rig | None
     path: Path
+    ground_z: float
 
     def __len__(self) -> int:
         """Number of frames."""

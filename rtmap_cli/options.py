@@ -1,0 +1,43 @@
+"""Options that several commands share, written once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+# Existence is checked by the readers, which exit with 3 and say what to do.
+PATH = click.Path(path_type=Path)
+
+
+def output(help_text: str, required: bool = True) -> Decorator:
+    """``-o / --output``: where the result goes."""
+    return click.option("-o", "--output", type=PATH, required=required, help=help_text)
+
+
+overwrite: Decorator = click.option(
+    "--overwrite", is_flag=True, help="Replace the output if it exists."
+)
+as_json: Decorator = click.option(
+    "--json", "as_json", is_flag=True, help="Print the result as one JSON object."
+)
+seed: Decorator = click.option(
+    "--seed", type=int, default=0, show_default=True, help="Seed of every random choice."
+)
+crs: Decorator = click.option(
+    "--crs", help="Projected metric CRS of the map frame, e.g. EPSG:32617."
+)
+map_path: Decorator = click.option(
+    "--map", "map_path", type=PATH, required=True, help="The map folder."
+)
+map_version: Decorator = click.option(
+    "--map-version", type=int, help="Version of the map (default: the newest)."
+)
+quiet: Decorator = click.option("-q", "--quiet", is_flag=True, help="No progress on stderr.")
+threads: Decorator = click.option(
+    "--threads", type=click.IntRange(1), help="Threads (default: the processor's cores)."
+)
