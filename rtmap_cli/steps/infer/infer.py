@@ -1,0 +1,290 @@
+"""Read a log with a network: {M, U, D, T^E} = Model(images, prior) of Eq. 1, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from rtmap_cli.errors import BadInput, NoAnswer
+from rtmap_cli.geometry.poses import se3_from_xyyaw, xyyaw_of, yaw_of
+from rtmap_cli.logs.log import Frame, Log
+from rtmap_cli.logs.run import (
+    MATCHED,
+    NEW,
+    OCCLUDERS,
+    OUTDATED,
+    Observations,
+    Run,
+    RunFrames,
+    run_info,
+)
+from rtmap_cli.maps.crop import MapIndex
+from rtmap_cli.maps.element import VectorMap
+from rtmap_cli.maps.prior import PriorSlots, prior_slots
+from rtmap_cli.steps.infer.images import FittedCamera
+from rtmap_cli.steps.infer.model import MapModel
+
+Array = NDArray[np.float64]
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
+
+
+@dataclass(frozen=True)
+class InferOptions:
+    """``score_threshold``: new elements below it are dropped; ``existence_threshold``: prior
+    elements below it are outdated; ``batch``: frames per call; ``threads``: decoding threads;
+    ``skip_bad_frames``: leave out frames that cannot be read and count them;
+    ``max_frames``: stop after so many; ``every``: take every n-th frame."""
+
+    score_threshold: float = 0.05
+    existence_threshold: float = 0.5
+    batch: int = 4
+    threads: int = 2
+    skip_bad_frames: bool = False
+    max_frames: int | None = None
+    every: int = 1
+
+
+@dataclass(frozen=True)
+class _Loaded:
+    frame: Frame
+    images: NDArray[np.uint8]
+    ego_to_image: NDArray[np.float32]
+
+
+def infer_log(
+    log: Log,
+    model: MapModel,
+    prior: VectorMap | None,
+    options: InferOptions,
+    progress: Progress = iter,
+    say: Callable[[str], None] = lambda _: None,
+    made_by: dict[str, Any] | None = None,
+) -> Run:
+    """Run the network over a log; without ``prior`` it is a first traversal.
+
+    The prior is cropped at each frame's initial pose, resampled to the model's V vertices and
+    given as prior queries; the answer for slot p is an observation with ``element_id``,
+    ``prior_points`` (D) and state matched or outdated, the other queries give state new.
+    Raises BadInput for unreadable frames (unless skipped) and NoAnswer when no frame is left.
+    """
+    if log.rig is None:
+        raise BadInput(log.path, "the log has no camera calibration", "infer needs one")
+    index = MapIndex(prior) if prior is not None else None
+    cameras = {
+        camera.name: FittedCamera(camera, model.info.image_size, model.info.horizon, log.ground_z)
+        for camera in log.rig
+    }
+    rows: list[tuple[Frame, int, Array, Array]] = []
+    parts: list[Observations] = []
+    skipped = dropped = 0
+    stream = _chosen(log, options)
+    with ThreadPoolExecutor(options.threads) as pool:
+        for batch in _batches(progress(_load_all(stream, cameras, pool, options)), options.batch):
+            good = []
+            for item in batch:
+                if isinstance(item, BadInput):
+                    skipped += 1
+                    say(f"skipped: {item}")
+                else:
+                    good.append(item)
+            if not good:
+                continue
+            slots = [_slots(index, item.frame, model) for item in good]
+            dropped += sum(s.dropped for s in slots)
+            out = _call(model, good, slots)
+            for k, item in enumerate(good):
+                parts.append(_observations(model, out, k, item.frame.index, slots[k], options))
+                pose, covariance = _end_to_end(item.frame, out, k, len(slots[k]))
+                rows.append((item.frame, len(item.images), pose, covariance))
+    if not rows:
+        raise NoAnswer(f"{log.path}: no frame could be read")
+    if dropped:
+        say(f"{dropped} prior elements found no slot (the model has {model.info.prior_slots})")
+    info = run_info(
+        log.log_id,
+        log.crs,
+        model.info.classes,
+        {"x": [model.info.range_m[0], model.info.range_m[2]],
+         "y": [model.info.range_m[1], model.info.range_m[3]]},
+        source="infer",
+        model=model.info.name,
+        model_sha256=model.info.sha256,
+        options=asdict(options),
+        frames=len(rows),
+        skipped_frames=skipped,
+        map_version=prior.version if prior is not None else None,
+        **(made_by or {}),
+    )  # fmt: skip
+    observations = Observations.concatenate(parts)
+    return Run(info, _frames(rows), observations, _occluders(rows))
+
+
+def _chosen(log: Log, options: InferOptions) -> Iterator[Frame]:
+    taken = 0
+    for k, frame in enumerate(log.frames()):
+        if k % options.every:
+            continue
+        if options.max_frames is not None and taken >= options.max_frames:
+            return
+        taken += 1
+        yield frame
+
+
+def _load(frame: Frame, cameras: dict[str, FittedCamera]) -> _Loaded:
+    names = [name for name in cameras if name in frame.images]
+    if not names:
+        raise BadInput(
+            f"frame {frame.index}", "has no images", "simulate them (rtmap simulate images) or skip"
+        )
+    images = np.stack([cameras[name].load(frame.images[name]) for name in names])
+    return _Loaded(frame, images, np.stack([cameras[name].ego_to_image for name in names]))
+
+
+def _load_all(
+    frames: Iterator[Frame],
+    cameras: dict[str, FittedCamera],
+    pool: ThreadPoolExecutor,
+    options: InferOptions,
+) -> Iterator[_Loaded | BadInput]:
+    """Decode ahead of the network, a bounded number of frames at a time, in order."""
+    from collections import deque
+
+    def guarded(frame: Frame) -> _Loaded | BadInput:
+        try:
+            return _load(frame, cameras)
+        except BadInput as error:
+            if not options.skip_bad_frames:
+                raise
+            return error
+
+    waiting: deque[Any] = deque()
+    for frame in frames:
+        waiting.append(pool.submit(guarded, frame))
+        if len(waiting) >= 2 * options.threads + options.batch:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
+
+
+def _batches(items: Iterable[_Loaded | BadInput], size: int) -> Iterator[list[_Loaded | BadInput]]:
+    """Consecutive frames with the same number of cameras, at most ``size`` of them."""
+    batch: list[_Loaded | BadInput] = []
+    count = -1
+    for item in items:
+        n = len(item.images) if isinstance(item, _Loaded) else count
+        if batch and (n != count or len(batch) == size):
+            yield batch
+            batch = []
+        count = n
+        batch.append(item)
+    if batch:
+        yield batch
+
+
+def _slots(index: MapIndex | None, frame: Frame, model: MapModel) -> PriorSlots:
+    info = model.info
+    local = index.crop(frame.map_SE3_ego, info.range_m) if index is not None else []
+    return prior_slots(local, frame.map_SE3_ego, info.classes, info.vertex_count, info.prior_slots)
+
+
+def _call(model: MapModel, batch: list[_Loaded], slots: list[PriorSlots]) -> dict[str, Any]:
+    """One call of the network; slots are padded with zeros to the fullest frame (at least 1)."""
+    count = max(1, max(len(s) for s in slots))
+    points = np.zeros((len(batch), count, model.info.vertex_count, 2), np.float32)
+    classes = np.zeros((len(batch), count), np.int64)
+    mask = np.zeros((len(batch), count), np.float32)
+    for k, s in enumerate(slots):
+        points[k, : len(s)] = s.points
+        classes[k, : len(s)] = s.class_index
+        mask[k, : len(s)] = 1
+    return model(
+        np.stack([item.images for item in batch]),
+        np.stack([item.ego_to_image for item in batch]),
+        points,
+        classes,
+        mask,
+    )
+
+
+def _observations(
+    model: MapModel,
+    out: dict[str, Any],
+    k: int,
+    frame: int,
+    slots: PriorSlots,
+    options: InferOptions,
+) -> Observations:
+    """The observations of frame ``k`` of a batch: prior queries first, then new ones by score."""
+    names = np.array(model.info.classes, dtype=object)
+    p, v = len(slots), model.info.vertex_count
+    first_prior = out["scores"].shape[1] - out["prior_score"].shape[1]
+    new_scores = out["scores"][k, :first_prior]
+    best = new_scores.argmax(axis=1)
+    score = new_scores[np.arange(first_prior), best]
+    keep = np.flatnonzero(score >= options.score_threshold)
+    keep = keep[np.argsort(-score[keep], kind="stable")]
+    existence = out["prior_score"][k, :p]
+    rows = np.concatenate([first_prior + np.arange(p), keep])
+    state = np.where(existence >= options.existence_threshold, MATCHED, OUTDATED)
+    unknown = np.full(len(keep), np.nan, np.float32)
+    return Observations(
+        frame=np.full(len(rows), frame, np.int32),
+        query=rows.astype(np.int32),
+        state=np.concatenate([state, np.full(len(keep), NEW)]).astype(np.int8),
+        class_name=np.concatenate([names[slots.class_index], names[best[keep]]]),
+        score=np.concatenate([existence, score[keep]]).astype(np.float32),
+        existence=np.concatenate([existence, unknown]).astype(np.float32),
+        element_id=np.array([*slots.element_ids, *([None] * len(keep))], dtype=object),
+        points=out["points"][k, rows].astype(np.float32),
+        sigma=np.maximum(out["sigma"][k, rows], 1e-3).astype(np.float32),
+        prior_points=np.concatenate([slots.map_points, np.full((len(keep), v, 2), np.nan)]),
+    )
+
+
+def _end_to_end(frame: Frame, out: dict[str, Any], k: int, slot_count: int) -> tuple[Array, Array]:
+    """T^E = T⁰ · SE2(δ): x, y, yaw in the map frame and its covariance; NaN without a prior."""
+    if not slot_count:
+        return np.full(3, np.nan), np.full((3, 3), np.nan)
+    delta = np.asarray(out["pose_delta"][k], np.float64)
+    pose = frame.map_SE3_ego @ se3_from_xyyaw(delta[0], delta[1], delta[2])
+    yaw = float(yaw_of(frame.map_SE3_ego))
+    turn = np.eye(3)
+    turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    return xyyaw_of(pose), turn @ np.asarray(out["pose_covariance"][k], np.float64) @ turn.T
+
+
+def _frames(rows: list[tuple[Frame, int, Array, Array]]) -> RunFrames:
+    unknown = np.full(3, np.nan)
+
+    def known(value: Array | None) -> Array:
+        return unknown if value is None else np.asarray(value, np.float64)
+
+    frames = [row[0] for row in rows]
+    return RunFrames(
+        frame=np.array([f.index for f in frames], np.int32),
+        timestamp_ns=np.array([f.timestamp_ns for f in frames], np.int64),
+        initial=np.stack([f.map_SE3_ego for f in frames]),
+        sigma=np.stack([f.sigma for f in frames]),
+        odometry=np.stack([known(f.odometry) for f in frames]),
+        odometry_sigma=np.stack([known(f.odometry_sigma) for f in frames]),
+        end_to_end=np.stack([row[2] for row in rows]),
+        end_to_end_covariance=np.stack([row[3] for row in rows]),
+        camera_count=np.array([row[1] for row in rows], np.int32),
+    )
+
+
+def _occluders(rows: list[tuple[Frame, int, Array, Array]]) -> pa.Table | None:
+    names = ("x", "y", "yaw", "length", "width", "height", "z")
+    boxes = [(frame.index, box) for frame, *_ in rows for box in frame.occluders]
+    if not boxes:
+        return None
+    columns: dict[str, Any] = {"frame": pa.array([f for f, _ in boxes], pa.int32())}
+    for name in names:
+        columns[name] = pa.array([getattr(box, name) for _, box in boxes], pa.float32())
+    return pa.table(columns, schema=OCCLUDERS.columns)
