@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import zlib
 
 import numpy as np
@@ -56,7 +57,7 @@ def _densify(points: Array, max_step: float) -> Array:
     s = arc_length(points)
     extra = [
         np.linspace(a, b, int(np.ceil((b - a) / max_step)) + 1)[1:-1]
-        for a, b in zip(s[:-1], s[1:], strict=True)
+        for a, b in itertools.pairwise(s)
         if b - a > max_step
     ]
     at = np.sort(np.concatenate([s, *extra]))
