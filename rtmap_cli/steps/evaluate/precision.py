@@ -1,0 +1,247 @@
+"""Average precision of detected map elements, as the field's own evaluators compute it.
+
+Protocols: ``maptr`` (MapTR, MapTRv2; 100 points, pairs whose 2 m bands touch), ``streammapnet``
+(200 points, every pair) and ``rtmap`` (the algorithm of ``maptr`` at the 72 × 36 m of the RTMap
+paper). All are planar. docs/evaluate.md tells the steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.errors import BadInput
+from rtmap_cli.geometry.chamfer import bands, chamfer_pairs
+from rtmap_cli.geometry.polylines import resample
+
+Array = NDArray[np.float64]
+
+Detection = tuple[str, Array, float]
+"""Class, vertices (n, 2 or more columns; the first two count) in metres, score."""
+
+THRESHOLDS = (0.5, 1.0, 1.5)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How one evaluator compares lines; ``range_m`` is the ego-frame box its numbers refer to."""
+
+    name: str
+    samples: int
+    band: float | None
+    keep_sampled: bool
+    drop_single: bool
+    range_m: tuple[float, float, float, float]
+
+
+PROTOCOLS = {
+    "maptr": Protocol("maptr", 100, 2.0, True, True, (-30.0, -15.0, 30.0, 15.0)),
+    "streammapnet": Protocol("streammapnet", 200, None, False, False, (-30.0, -15.0, 30.0, 15.0)),
+    "rtmap": Protocol("rtmap", 100, 2.0, True, True, (-36.0, -18.0, 36.0, 18.0)),
+}
+
+
+@dataclass(frozen=True)
+class ClassScore:
+    """Average precision ``ap`` and true positives ``tp`` of one class by threshold (m)."""
+
+    ap: dict[float, float]
+    tp: dict[float, int]
+    num_gt: int
+    num_pred: int
+
+    @property
+    def mean(self) -> float:
+        """Mean AP over the thresholds."""
+        return float(np.mean(list(self.ap.values())))
+
+
+@dataclass(frozen=True)
+class MapScore:
+    """The result of one evaluation; all APs lie in [0, 1]."""
+
+    protocol: str
+    classes: dict[str, ClassScore]
+    frames: int
+
+    @property
+    def mAP(self) -> float:  # noqa: N802 - the field's own word
+        """Plain mean over all classes; a class without true elements counts as 0."""
+        return float(np.mean([c.mean for c in self.classes.values()])) if self.classes else 0.0
+
+    @property
+    def without_truth(self) -> list[str]:
+        """Classes without any true element: their 0 says nothing about the predictions."""
+        return [name for name, c in self.classes.items() if not c.num_gt]
+
+    def as_json(self) -> dict[str, Any]:
+        """``{"protocol", "mAP", "classes": {name: {"ap", "tp", "num_gt", "num_pred"}}}``."""
+        classes = {
+            name: {
+                "ap": {str(t): v for t, v in c.ap.items()},
+                "tp": {str(t): v for t, v in c.tp.items()},
+                "num_gt": c.num_gt,
+                "num_pred": c.num_pred,
+            }
+            for name, c in self.classes.items()
+        }
+        return {"protocol": self.protocol, "mAP": self.mAP, "classes": classes}
+
+
+def evaluate_frames(
+    pred: Iterable[Sequence[Detection]],
+    truth: Iterable[Sequence[Detection]],
+    classes: Sequence[str],
+    thresholds: Sequence[float] = THRESHOLDS,
+    protocol: str = "rtmap",
+) -> MapScore:
+    """Score predictions against truth, frame by frame in the same order.
+
+    Each frame is a sequence of (class, vertices, score), vertices in metres of any frame that both
+    share; the score of a true element is ignored, as are elements of other ``classes``. Nothing is
+    cropped here. Equal scores keep the order of the input. Frames may be generators: only scores
+    and hits are kept. Raises BadInput for vertices that are not finite, a score that is NaN, a
+    true element of one vertex, and (streammapnet) a predicted one.
+    """
+    scorer = Scorer(classes, thresholds, protocol)
+    for p, t in zip(pred, truth, strict=True):
+        scorer.add(p, t)
+    return scorer.result()
+
+
+@dataclass
+class _Ranking:
+    """Scores and hits (one column per threshold) of one class, in input order."""
+
+    num_gt: int = 0
+    scores: list[Array] = field(default_factory=list)
+    hits: list[NDArray[np.bool_]] = field(default_factory=list)
+
+
+class Scorer:
+    """Collects frames and ranks them at the end; memory grows with predictions, not geometry."""
+
+    def __init__(
+        self,
+        classes: Sequence[str],
+        thresholds: Sequence[float] = THRESHOLDS,
+        protocol: str = "rtmap",
+    ) -> None:
+        self.protocol = PROTOCOLS[protocol]
+        self.thresholds = np.array(sorted(thresholds), dtype=np.float64)
+        self.rankings = {name: _Ranking() for name in classes}
+        self.frames = 0
+
+    def add(
+        self, pred: Sequence[Detection], truth: Sequence[Detection], name: str | None = None
+    ) -> None:
+        """Add one frame; ``name`` (default: its number) is used in error messages."""
+        where = f"frame {self.frames if name is None else name}"
+        for class_name, ranking in self.rankings.items():
+            predicted = [p for p in pred if p[0] == class_name]
+            if self.protocol.drop_single:
+                predicted = [p for p in predicted if len(p[1]) > 1]
+            true = [t for t in truth if t[0] == class_name]
+            scores = np.array([p[2] for p in predicted], dtype=np.float64)
+            if not np.isfinite(scores).all():
+                raise BadInput(where, f"a predicted {class_name} has a score that is not finite")
+            lines = self._sampled([p[1] for p in predicted], self.protocol.keep_sampled, where)
+            targets = self._sampled([t[1] for t in true], False, where)
+            ranking.num_gt += len(true)
+            ranking.scores.append(scores)
+            ranking.hits.append(self._hits(scores, lines, targets))
+        self.frames += 1
+
+    def result(self) -> MapScore:
+        """Rank everything added so far."""
+        return MapScore(
+            self.protocol.name,
+            {name: self._score(ranking) for name, ranking in self.rankings.items()},
+            self.frames,
+        )
+
+    def _sampled(self, lines: list[Array], keep: bool, where: str) -> Array:
+        """(n, samples, 2) points at equal arc length."""
+        count = self.protocol.samples
+        out = np.zeros((len(lines), count, 2))
+        for k, line in enumerate(lines):
+            points = np.asarray(line, dtype=np.float64)
+            if points.ndim != 2 or len(points) < 2:
+                raise BadInput(
+                    where,
+                    "an element has fewer than 2 vertices",
+                    f"protocol {self.protocol.name} has no rule for it",
+                )
+            points = points[:, :2]
+            if not np.isfinite(points).all():
+                raise BadInput(where, "a vertex is not finite")
+            out[k] = points if keep and len(points) == count else resample(points, count)
+        return out
+
+    def _distances(self, lines: Array, targets: Array) -> Array:
+        """(n, m) Chamfer distances; infinite where the largest threshold is out of reach."""
+        out = np.full((len(lines), len(targets)), np.inf)
+        i, j = (k.ravel() for k in np.indices(out.shape))
+        found = chamfer_pairs(lines, targets, i, j, float(self.thresholds[-1]))
+        near = np.flatnonzero(np.isfinite(found))
+        if self.protocol.band is not None and len(near):
+            near = near[_bands_touch(lines, targets, i[near], j[near], self.protocol.band)]
+        out[i[near], j[near]] = found[near]
+        return out
+
+    def _hits(self, scores: Array, lines: Array, targets: Array) -> NDArray[np.bool_]:
+        """(n, thresholds): by falling score, each line may take only its nearest true element."""
+        hits = np.zeros((len(lines), len(self.thresholds)), dtype=bool)
+        if not len(lines) or not len(targets):
+            return hits
+        distances = self._distances(lines, targets)
+        nearest = distances.argmin(axis=1)
+        within = distances[np.arange(len(lines)), nearest][:, None] <= self.thresholds
+        taken = np.zeros((len(targets), len(self.thresholds)), dtype=bool)
+        for k in np.argsort(-scores, kind="stable"):
+            hits[k] = within[k] & ~taken[nearest[k]]
+            taken[nearest[k]] |= hits[k]
+        return hits
+
+    def _score(self, ranking: _Ranking) -> ClassScore:
+        n = len(self.thresholds)
+        scores = np.concatenate([np.zeros(0), *ranking.scores])
+        hits = np.concatenate([np.zeros((0, n), dtype=bool), *ranking.hits])
+        hits = hits[np.argsort(-scores, kind="stable")]
+        names = [float(t) for t in self.thresholds]
+        return ClassScore(
+            ap={t: average_precision(hits[:, k], ranking.num_gt) for k, t in enumerate(names)},
+            tp={t: int(hits[:, k].sum()) for k, t in enumerate(names)},
+            num_gt=ranking.num_gt,
+            num_pred=len(scores),
+        )
+
+
+def _bands_touch(
+    lines: Array, targets: Array, i: NDArray[np.intp], j: NDArray[np.intp], half_width: float
+) -> NDArray[np.bool_]:
+    import shapely
+
+    left, left_of = np.unique(i, return_inverse=True)
+    right, right_of = np.unique(j, return_inverse=True)
+    a, b = bands(lines[left], half_width), bands(targets[right], half_width)
+    touch: NDArray[np.bool_] = shapely.intersects(a[left_of], b[right_of])
+    return touch
+
+
+def average_precision(hits: NDArray[np.bool_], num_gt: int) -> float:
+    """Area under the precision envelope, summed at every recall step.
+
+    ``hits`` (n,) says of each prediction, by falling score, whether it is a true positive. The
+    precision at a recall is the highest one at that or a larger recall. 0 without truth.
+    """
+    if not len(hits) or not num_gt:
+        return 0.0
+    tp = np.cumsum(hits)
+    precision = tp / np.arange(1, len(hits) + 1)
+    envelope = np.maximum.accumulate(precision[::-1])[::-1]
+    return float(envelope[hits].sum() / num_gt)
