@@ -72,7 +72,7 @@ def clip_to_box(points: Array, box: tuple[float, float, float, float]) -> list[A
     d = b - a
     low, high = np.zeros(len(d)), np.ones(len(d))
     outside = np.zeros(len(d), dtype=bool)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for axis, (lo, hi) in enumerate(((x0, x1), (y0, y1))):
             flat = d[:, axis] == 0
             outside |= flat & ((a[:, axis] < lo) | (a[:, axis] > hi))

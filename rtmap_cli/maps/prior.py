@@ -44,17 +44,14 @@ def prior_slots(
     than slots the farthest are dropped and counted.
     """
     known = [e for e in local if e.class_name in classes]
-    if len(known) > max_slots:
-        distance = [float(np.hypot(*e.points[:, :2].T).min()) for e in known]
-        keep = sorted(np.argsort(distance, kind="stable")[:max_slots])
-        chosen = [known[i] for i in keep]
-    else:
-        chosen = known
-    points = np.zeros((len(chosen), vertex_count, 2))
-    for k, element in enumerate(chosen):
+    points = np.zeros((len(known), vertex_count, 2))
+    for k, element in enumerate(known):
         points[k] = resample(element.points[:, :2], vertex_count)
         if is_ring(element.points):
             points[k, -1] = points[k, 0]
+    distance = np.hypot(points[..., 0], points[..., 1]).min(axis=1, initial=np.inf)
+    keep = np.sort(np.argsort(distance, kind="stable")[:max_slots])
+    chosen, points = [known[i] for i in keep], points[keep]
     return PriorSlots(
         points=points,
         class_index=np.array([classes.index(e.class_name) for e in chosen], np.int64),
