@@ -11,40 +11,40 @@ map.
 
 from __future__ import annotations
 
-import hashlib
-import json
-import time
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from rtmap_cli import __version__
 from rtmap_cli.errors import BadInput
 from rtmap_cli.maps.crs import check_map_crs, check_same_crs
-from rtmap_cli.maps.element import Element, VectorMap
-from rtmap_cli.maps.place import LOG, TILES, Place
-from rtmap_cli.maps.tiles import (
-    TILE,
-    ZOOM,
-    elements_to_table,
-    table_to_elements,
-    tile_bytes,
-    tile_of,
-    tile_statistics,
+from rtmap_cli.maps.delta import (
+    Box,
+    add_action,
+    app_id,
+    create_table,
+    element_count,
+    ever_added,
+    first_line,
+    open_table,
+    read_properties,
+    read_tile,
+    tile_files,
+    tile_name,
+    transactions,
+    write_version,
 )
-from rtmap_cli.tables import read_table, whole_folder
+from rtmap_cli.maps.element import Element, VectorMap
+from rtmap_cli.maps.place import LOG, Place
+from rtmap_cli.maps.tiles import elements_to_table, table_to_elements, tile_bytes, tile_of
+from rtmap_cli.tables import whole_folder
 
 PRODUCER = f"rtmap {__version__}"
-MAP_FORMAT = "rtmap.map"
-MAP_VERSION = "1.0"
 COMMIT_ATTEMPTS = 20
-
-Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,11 @@ def read_map(path: str | Path, version: int | None = None, bbox: Box | None = No
     or a tile is missing or broken.
     """
     place = Place.of(path)
-    table = _open(place, version)
-    properties = _properties(place, table)
+    table = open_table(place, version)
+    properties = read_properties(place, table)
     elements: list[Element] = []
-    for name in sorted(_files(table, bbox)):
-        elements.extend(table_to_elements(_read_tile(place, name, bbox), place.file(name)))
+    for name in sorted(tile_files(table, bbox)):
+        elements.extend(table_to_elements(read_tile(place, name, bbox), place.file(name)))
     elements.sort(key=lambda e: e.element_id)
     return VectorMap(elements, properties["crs"], table.version())
 
@@ -88,7 +88,7 @@ def read_map(path: str | Path, version: int | None = None, bbox: Box | None = No
 def map_crs(path: str | Path) -> str:
     """The CRS of a map's frame, without reading a tile."""
     place = Place.of(path)
-    return str(_properties(place, _open(place))["crs"])
+    return str(read_properties(place, open_table(place))["crs"])
 
 
 def write_new_map(
@@ -105,9 +105,6 @@ def write_new_map(
     BadInput when ``path`` exists and ``overwrite`` is False, when the CRS is not metric, or when
     two elements share an id.
     """
-    from deltalake import CommitProperties, Schema
-    from deltalake.transaction import create_table_with_add_actions
-
     check_map_crs(vector_map.crs, path)
     tables = _by_tile(vector_map, path)
     runs = _unique(runs)
@@ -117,30 +114,13 @@ def write_new_map(
         added = []
         for tile, table in tables.items():
             data = tile_bytes(table, vector_map.crs, tile)
-            name = _tile_name(tile, data)
+            name = tile_name(tile, data)
             place.write(name, data)
-            added.append(_add_action(name, tile, data, table))
-        properties = {
-            "format": MAP_FORMAT,
-            "version": MAP_VERSION,
-            "crs": vector_map.crs,
-            "tile_zoom": ZOOM,
-        }
+            added.append(add_action(name, tile, data, table))
         metadata = _commit_metadata(
             message, producer, vector_map, runs, info, len(added), removed=0
         )
-        create_table_with_add_actions(
-            place.uri,
-            Schema.from_arrow(_delta_schema()),
-            added,
-            partition_by=["tile"],
-            description=json.dumps(properties, sort_keys=True),
-            # Old versions stay readable: only `gc` takes anything away.
-            configuration={"delta.enableExpiredLogCleanup": "false"},
-            commit_properties=CommitProperties(
-                custom_metadata=metadata, app_transactions=_transactions(runs, 1)
-            ),
-        )
+        create_table(place, vector_map.crs, added, metadata, runs)
     return 0
 
 
@@ -162,16 +142,16 @@ def commit_map(
     from deltalake.exceptions import CommitFailedError
 
     place = Place.of(path)
-    base = _open(place, base_version)
-    check_same_crs(new.crs, _properties(place, base)["crs"], path)
+    base = open_table(place, base_version)
+    check_same_crs(new.crs, read_properties(place, base)["crs"], path)
     runs = _unique(runs)
-    _check_runs(place, _open(place), runs)
+    _check_runs(place, open_table(place), runs)
     change = _compare(place, base, new)
     for name, data in change.data.items():
-        if not place.exists(name):
-            place.write(name, data)
+        # Also when an orphan of this name lies there: its age would make it a case for `gc`.
+        place.write(name, data)
     for _ in range(COMMIT_ATTEMPTS):
-        latest = _open(place)
+        latest = open_table(place)
         _check_runs(place, latest, runs)
         if latest.version() != base_version:
             _check_conflict(place, base, latest, change)
@@ -179,7 +159,7 @@ def commit_map(
             message, producer, new, runs, info, len(change.added), len(change.removed)
         )
         try:
-            return _write_version(latest, change, metadata, runs)
+            return write_version(latest, change.added, change.removed, metadata, runs)
         except CommitFailedError:
             # Somebody was faster: look at what they did, and try again.
             continue
@@ -190,7 +170,7 @@ def history(path: str | Path) -> list[Version]:
     """The versions of a map, oldest first."""
     place = Place.of(path)
     out = []
-    for entry in sorted(_open(place).history(), key=lambda e: int(e["version"])):
+    for entry in sorted(open_table(place).history(), key=lambda e: int(e["version"])):
         parameters = entry.get("operationParameters") or {}
         restored = parameters.get("version") if entry.get("operation") == "RESTORE" else None
         out.append(
@@ -235,11 +215,11 @@ def restore(path: str | Path, version: int, message: str | None = None) -> int:
     from deltalake.exceptions import DeltaError
 
     place = Place.of(path)
-    latest = _open(place)
-    target = _open(place, version)
+    latest = open_table(place)
+    target = open_table(place, version)
     if version == latest.version():
         raise BadInput(path, f"version {version} is the newest one already", "nothing to restore")
-    for name in sorted(_files(target)):
+    for name in sorted(tile_files(target)):
         if not place.exists(name):
             raise BadInput(
                 place.file(name),
@@ -248,20 +228,21 @@ def restore(path: str | Path, version: int, message: str | None = None) -> int:
             )
     now, then = fused_runs(path), fused_runs(path, version)
     # A txn version of 0 says that the run is not in the content any more.
-    moves = _transactions(sorted(now - then), 0)
-    moves += _transactions(sorted(then - now), latest.version() + 2)
-    count = sum(_record_counts(target))
+    moves = transactions(sorted(now - then), 0)
+    moves += transactions(sorted(then - now), latest.version() + 2)
     metadata = {
         "rtmap.message": message or f"restore version {version}",
         "rtmap.producer": PRODUCER,
-        "rtmap.elements": count,
+        "rtmap.elements": element_count(target),
     }
     properties = CommitProperties(custom_metadata=metadata, app_transactions=moves)
     try:
         latest.restore(version, commit_properties=properties)
     except DeltaError as error:
-        raise BadInput(path, f"version {version} cannot be restored ({_line(error)})") from None
-    return int(_open(place).version())
+        raise BadInput(
+            path, f"version {version} cannot be restored ({first_line(error)})"
+        ) from None
+    return int(open_table(place).version())
 
 
 def gc(
@@ -277,12 +258,12 @@ def gc(
     belong to a commit under way and stay.
     """
     place = Place.of(path)
-    latest = _open(place).version()
+    latest = open_table(place).version()
     if keep is None:
-        needed = _ever_added(place)
+        needed = ever_added(place)
     else:
         first = max(0, latest - keep + 1)
-        needed = {n for v in range(first, latest + 1) for n in _files(_open(place, v))}
+        needed = {n for v in range(first, latest + 1) for n in tile_files(open_table(place, v))}
     removed = []
     for name, size, age in place.data_files():
         if name not in needed and age >= min_age_s:
@@ -303,38 +284,8 @@ class _Change:
     new_ids: set[str] = field(default_factory=set)
 
 
-def _delta_schema() -> pa.Schema:
-    return TILE.columns.append(pa.field("tile", pa.string()))
-
-
 def _unique(runs: Iterable[str]) -> list[str]:
     return sorted(set(runs))
-
-
-def _line(error: Exception) -> str:
-    text = str(error).strip()
-    return text.splitlines()[0] if text else type(error).__name__
-
-
-def _transactions(runs: Iterable[str], version: int) -> list[Any]:
-    from deltalake.transaction import Transaction
-
-    return [Transaction(_app_id(run), version) for run in runs]
-
-
-def _app_id(run: str) -> str:
-    return f"rtmap.run:{run}"
-
-
-def _tile_name(tile: str, data: bytes) -> str:
-    return f"{TILES}/{tile}/{hashlib.sha256(data).hexdigest()}.parquet"
-
-
-def _add_action(name: str, tile: str, data: bytes, table: pa.Table) -> Any:
-    from deltalake.transaction import AddAction
-
-    now = int(time.time() * 1000)
-    return AddAction(name, len(data), {"tile": tile}, now, True, tile_statistics(table))
 
 
 def _commit_metadata(
@@ -372,107 +323,29 @@ def _by_tile(vector_map: VectorMap, path: str | Path) -> dict[str, pa.Table]:
     return {tile: elements_to_table(groups[tile]) for tile in sorted(groups)}
 
 
-def _open(place: Place, version: int | None = None) -> Any:
-    """The Delta table at a version (default: the newest)."""
-    from deltalake import DeltaTable
-    from deltalake.exceptions import DeltaError
-
-    if not place.root.exists():
-        raise BadInput(place.root, "no such map folder", "make one with `rtmap import`")
-    if not (place.root / LOG).is_dir():
-        raise BadInput(place.root, f"not a map (there is no {LOG} in it)")
-    try:
-        table = DeltaTable(place.uri)
-        if version is not None and not 0 <= version <= table.version():
-            raise BadInput(place.root, f"has no version {version} (newest: {table.version()})")
-        if version is not None and version != table.version():
-            table.load_as_version(version)
-    except (DeltaError, OSError, ValueError) as error:
-        raise BadInput(
-            place.root / LOG, f"the versions cannot be read ({_line(error)})", "copy the map again"
-        ) from None
-    return table
-
-
-def _properties(place: Place, table: Any) -> dict[str, Any]:
-    """Format, CRS and zoom of a map; BadInput when it is another Delta table or too new."""
-    try:
-        properties = json.loads(table.metadata().description or "{}")
-    except ValueError:
-        properties = {}
-    if not isinstance(properties, dict) or properties.get("format") != MAP_FORMAT:
-        raise BadInput(place.root, "a Delta table, but not an rtmap map")
-    found = str(properties.get("version", "?"))
-    if found.split(".")[0] != MAP_VERSION.split(".")[0]:
-        raise BadInput(
-            place.root,
-            f"map version {found} is unknown to this rtmap (it reads {MAP_VERSION})",
-            "use the rtmap that wrote it, or a newer one",
-        )
-    return properties
-
-
-def _actions(table: Any) -> pa.Table:
-    return pa.table(table.get_add_actions(flatten=True))
-
-
-def _files(table: Any, bbox: Box | None = None) -> dict[str, str]:
-    """Quadkey by file name, of the files that may hold something in ``bbox``."""
-    actions = _actions(table)
-    if actions.num_rows == 0:
-        return {}
-    files = dict(
-        zip(actions["path"].to_pylist(), actions["partition.tile"].to_pylist(), strict=True)
-    )
-    if bbox is None or "min.bbox.xmin" not in actions.column_names:
-        return files
-    names = ("min.bbox.xmin", "min.bbox.ymin", "max.bbox.xmax", "max.bbox.ymax")
-    # Without statistics (NaN) a file may hold anything.
-    low_x, low_y, high_x, high_y = (actions[n].to_numpy().astype(np.float64) for n in names)
-    apart = (low_x > bbox[2]) | (low_y > bbox[3]) | (high_x < bbox[0]) | (high_y < bbox[1])
-    return {name: tile for (name, tile), off in zip(files.items(), apart, strict=True) if not off}
-
-
-def _record_counts(table: Any) -> list[int]:
-    actions = _actions(table)
-    return [int(n or 0) for n in actions["num_records"].to_pylist()] if actions.num_rows else []
-
-
-def _read_tile(place: Place, name: str, bbox: Box | None = None) -> pa.Table:
-    table = read_table(place.file(name), TILE)
-    if bbox is None or table.num_rows == 0:
-        return table
-    box = table["bbox"].combine_chunks()
-    x0, y0, x1, y1 = (
-        box.field(n).to_numpy(zero_copy_only=False) for n in ("xmin", "ymin", "xmax", "ymax")
-    )
-    touch = (x0 <= bbox[2]) & (y0 <= bbox[3]) & (x1 >= bbox[0]) & (y1 >= bbox[1])
-    return table.filter(pa.array(touch))
-
-
 def _compare(place: Place, base: Any, new: VectorMap) -> _Change:
     """The tiles of ``new`` that differ from the files of ``base``."""
     old: dict[str, list[str]] = defaultdict(list)
-    for name, tile in _files(base).items():
+    for name, tile in tile_files(base).items():
         old[tile].append(name)
     tables = _by_tile(new, place.root)
     change = _Change()
     old_ids: set[str] = set()
     for tile, table in tables.items():
         data = tile_bytes(table, new.crs, tile)
-        name = _tile_name(tile, data)
+        name = tile_name(tile, data)
         if old[tile] == [name] or _same_content(place, old[tile], table):
             continue
         change.tiles.add(tile)
         change.data[name] = data
-        change.added.append(_add_action(name, tile, data, table))
+        change.added.append(add_action(name, tile, data, table))
         change.removed |= {n: tile for n in old[tile]}
         change.new_ids.update(table["element_id"].to_pylist())
     for tile in sorted(set(old) - set(tables)):
         change.tiles.add(tile)
         change.removed |= {n: tile for n in old[tile]}
     for name in change.removed:
-        old_ids.update(_read_tile(place, name)["element_id"].to_pylist())
+        old_ids.update(read_tile(place, name)["element_id"].to_pylist())
     change.new_ids -= old_ids
     return change
 
@@ -480,19 +353,19 @@ def _compare(place: Place, base: Any, new: VectorMap) -> _Change:
 def _same_content(place: Place, names: list[str], table: pa.Table) -> bool:
     """True when one file holds the same rows: another pyarrow gives other bytes for them."""
     return len(names) == 1 and bool(
-        _read_tile(place, names[0]).replace_schema_metadata(None).equals(table)
+        read_tile(place, names[0]).replace_schema_metadata(None).equals(table)
     )
 
 
 def _check_runs(place: Place, latest: Any, runs: list[str]) -> None:
     for run in runs:
-        if (latest.transaction_version(_app_id(run)) or 0) > 0:
+        if (latest.transaction_version(app_id(run)) or 0) > 0:
             raise BadInput(place.root, f"run {run} was fused into this map before", "leave it out")
 
 
 def _check_conflict(place: Place, base: Any, latest: Any, change: _Change) -> None:
     """BadInput when somebody else changed a tile of ours, or added an element of the same id."""
-    before, after = _files(base), _files(latest)
+    before, after = tile_files(base), tile_files(latest)
     theirs = {n: t for n, t in (before | after).items() if (n in before) != (n in after)}
     both = sorted(set(theirs.values()) & change.tiles)
     todo = "start again from the newest version"
@@ -504,43 +377,8 @@ def _check_conflict(place: Place, base: Any, latest: Any, change: _Change) -> No
         )
     for name in theirs:
         if name in after:
-            same = change.new_ids.intersection(_read_tile(place, name)["element_id"].to_pylist())
+            same = change.new_ids.intersection(read_tile(place, name)["element_id"].to_pylist())
             if same:
                 raise BadInput(
                     place.root, f"element {min(same)} was added by somebody else meanwhile", todo
                 )
-
-
-def _write_version(table: Any, change: _Change, metadata: dict[str, Any], runs: list[str]) -> int:
-    from deltalake import CommitProperties, Schema
-    from deltalake.transaction import RemoveAction
-
-    now = int(time.time() * 1000)
-    actions = list(change.added)
-    actions += [
-        RemoveAction(name, True, now, None, {"tile": tile}) for name, tile in change.removed.items()
-    ]
-    version = int(table.version()) + 1
-    table.create_write_transaction(
-        actions,
-        "append",
-        Schema.from_arrow(_delta_schema()),
-        partition_by=["tile"],
-        commit_properties=CommitProperties(
-            custom_metadata=metadata,
-            max_commit_retries=0,
-            app_transactions=_transactions(runs, version + 1),
-        ),
-    )
-    return version
-
-
-def _ever_added(place: Place) -> set[str]:
-    """Names of all files that any version registered."""
-    out = set()
-    for name in place.log_files():
-        for line in place.read(name).splitlines():
-            action = json.loads(line)
-            if "add" in action:
-                out.add(action["add"]["path"])
-    return out

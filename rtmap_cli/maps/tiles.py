@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -245,6 +246,11 @@ def table_to_elements(table: pa.Table, path: str | Path) -> list[Element]:
     return out
 
 
+@lru_cache(maxsize=16)
+def _projjson(crs: str) -> Any:
+    return parse_crs(crs).to_json_dict()
+
+
 def geo_metadata(table: pa.Table, crs: str) -> str:
     """The ``geo`` metadata of GeoParquet 1.1 (https://geoparquet.org/releases/v1.1.0/)."""
     kinds = {struct.unpack_from("<I", blob, 1)[0] for blob in table["geometry"].to_pylist()}
@@ -252,7 +258,7 @@ def geo_metadata(table: pa.Table, crs: str) -> str:
     column: dict[str, Any] = {
         "encoding": "WKB",
         "geometry_types": sorted(names[k % _Z] + (" Z" if k >= _Z else "") for k in kinds),
-        "crs": parse_crs(crs).to_json_dict(),
+        "crs": _projjson(crs),
         "edges": "planar",
         "covering": {"bbox": {name: ["bbox", name] for name in BBOX}},
     }
