@@ -112,7 +112,7 @@ def _broken(change: Any) -> dict[str, Any]:
         (lambda d: d.pop("meta"), "meta is missing"),
         (lambda d: d["meta"].pop("log_id"), "meta.log_id"),
         (lambda d: d["meta"].update(crs_of_poses="EPSG:4326"), "projected"),
-        (lambda d: d["meta"].update(crs_of_poses="nonsense"), "unknown"),
+        (lambda d: d["meta"].update(crs_of_poses="nonsense"), "not a CRS"),
         (lambda d: d.update(results=[]), "no frames"),
         (lambda d: d["results"][1].update(frame=0), "twice"),
         (lambda d: d["results"][1].update(timestamp_ns=5), "earlier"),

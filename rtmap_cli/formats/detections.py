@@ -35,6 +35,7 @@ from rtmap_cli.logs.run import (
     run_info,
     true_poses,
 )
+from rtmap_cli.maps.crs import check_map_crs
 from rtmap_cli.tables import read_json
 
 Array = NDArray[np.float64]
@@ -134,16 +135,10 @@ def _range(path: Path, range_m: Any) -> dict[str, list[float]]:
 
 
 def _projected(path: Path, crs: Any) -> str:
-    """The CRS as given, if it is projected and in metres."""
-    import pyproj
-
-    try:
-        known = pyproj.CRS.from_user_input(crs)
-    except pyproj.exceptions.CRSError:
-        raise BadInput(path, f"CRS {crs} is unknown", "name one like EPSG:32617") from None
-    if not known.is_projected or known.axis_info[0].unit_conversion_factor != 1.0:
-        raise BadInput(path, f"CRS {crs} is not a projected one in metres")
-    return str(crs)
+    """The CRS as given, if it can carry a map frame."""
+    if not isinstance(crs, str):
+        raise BadInput(path, "its CRS is missing", "name one like EPSG:32617")
+    return check_map_crs(crs, path)
 
 
 def _numbers(path: Path, where: str, row: Any, keys: tuple[str, ...]) -> list[float]:
