@@ -147,5 +147,4 @@ def _av2(spec: str | Path) -> Drive:
     from rtmap_cli.formats.av2 import Av2Log
 
     log = Av2Log(Path(str(spec).removeprefix("av2:")))
-    times, pose = log.poses
-    return Drive(log.log_id, log.crs, times, pose)
+    return Drive(log.log_id, log.crs, log.pose_times, log.poses)

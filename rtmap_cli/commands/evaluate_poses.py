@@ -1,0 +1,60 @@
+"""rtmap evaluate poses: lateral, longitudinal and yaw errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rtmap_cli import options
+
+
+@click.command("poses")
+@click.argument("run", type=options.PATH)
+@click.option(
+    "--truth", required=True, help="True poses: simulated or AV2 log, poses table, fleet poses."
+)
+@click.option("--traversal", help="Which drive of a fleet poses file (default: by the log id).")
+@click.option("--initial", is_flag=True, help="Judge the initial poses, not the localized ones.")
+@options.as_json
+def command(run: Path, truth: str, traversal: str | None, initial: bool, as_json: bool) -> None:
+    """Errors of the localized poses of RUN in the true vehicle's own frame.
+
+    Mean and 90th percentile over the frames with an answer, the share of those frames, and how
+    often the truth lies inside the stated 50 % and 90 % regions. RUN and --truth may also both
+    be a JSON file of pose pairs (docs/evaluate.md).
+
+    \b
+    Example:
+      rtmap evaluate poses runs/drive-00 --truth logs/drive-00
+    """
+    from rtmap_cli.output import emit
+    from rtmap_cli.steps.evaluate.judge import judge_pairs, judge_run
+
+    if run.name.endswith((".json", ".json.gz")):
+        cases = judge_pairs(run, truth)
+        emit(
+            {"cases": cases}, as_json, [line for n, c in cases.items() for line in [n, *_lines(c)]]
+        )
+        return
+    result = judge_run(run, truth, traversal, initial)
+    emit(result, as_json, _lines(result))
+
+
+def _lines(result: dict[str, Any]) -> list[str]:
+    from rtmap_cli.output import table
+
+    def show(value: float | None) -> str:
+        return "-" if value is None else f"{value:.3f}"
+
+    names = {"lateral_m": "lateral (m)", "longitudinal_m": "longitudinal (m)", "yaw_deg": "yaw (°)"}
+    rows = [[text, show(result[k]["mean"]), show(result[k]["p90"])] for k, text in names.items()]
+    out = table(["error", "mean", "90 %"], rows)
+    if "frames" in result:
+        out.append(f"{result['n']} of {result['frames']} frames have an answer")
+    if result.get("consistency"):
+        inside = result["consistency"]["inside"]
+        told = ", ".join(f"{v['all']:.1%} in the {k} % region" for k, v in inside.items())
+        out.append(f"truth: {told}")
+    return out

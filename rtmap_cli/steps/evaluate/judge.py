@@ -1,0 +1,255 @@
+"""Poses and changes of files against their truth: reading, matching by time, figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.errors import BadInput
+from rtmap_cli.formats.changes_json import ChangeFile, read_changes
+from rtmap_cli.geometry.poses import se3_from_quaternion, se3_from_xyyaw
+from rtmap_cli.logs.run import Run, read_run
+from rtmap_cli.maps.crs import check_same_crs, lonlat_to, utm_crs
+from rtmap_cli.steps.evaluate.changes import (
+    FRAME_RANGE,
+    Change,
+    ChangeScore,
+    changed_frames,
+    frame_accuracy,
+    score_changes,
+)
+from rtmap_cli.steps.evaluate.drives import Drive, drive_of, read_drives
+from rtmap_cli.steps.evaluate.poses import consistency, pose_errors, summarize
+from rtmap_cli.tables import read_json
+
+Array = NDArray[np.float64]
+
+PLANAR = [0, 1, 5]
+"""Rows of x, y and yaw in a 6 × 6 pose covariance."""
+
+KINDS = ("insert", "delete", "modify")
+"""Changes that can be seen from geometry; others (paint) are not judged."""
+
+
+def judge_run(
+    run_path: Path, truth: str | Path, traversal: str | None = None, initial: bool = False
+) -> dict[str, Any]:
+    """Errors of a run's poses: ``summarize`` over the frames with an answer, and more.
+
+    ``frames`` and ``share_answered`` say how many frames had one (any status but no-match),
+    ``all_frames`` puts the initial pose where there is none, ``consistency`` judges the stated
+    covariances. ``initial`` judges T⁰ and its sigmas instead.
+    """
+    run = read_run(run_path)
+    if run.poses is None and not initial:
+        raise BadInput(run_path, "has no poses yet", "run rtmap localize first, or pass --initial")
+    drive = drive_of(read_drives(truth, traversal), run.log_id, truth)
+    check_same_crs(run.crs, drive.crs, run_path)
+    true, known = drive.at(run.frames.timestamp_ns)
+    if not known.all():
+        first = int(run.frames.timestamp_ns[~known][0])
+        raise BadInput(
+            truth,
+            f"no pose at {first} ns ({int((~known).sum())} of {len(known)} frames have none)",
+            f"is it the truth of {run.log_id}?",
+        )
+    estimate, covariance, status = _estimates(run, initial)
+    answered = status != "no-match"
+    result = summarize(pose_errors(true[answered], estimate[answered]))
+    honest = consistency(true[answered], estimate[answered], covariance[answered])
+    return result | {
+        "method": "initial" if initial or run.poses is None else run.poses.method,
+        "frames": len(true),
+        "share_answered": float(answered.mean()),
+        "status": {str(s): int((status == s).sum()) for s in dict.fromkeys(status)},
+        "all_frames": summarize(pose_errors(true, estimate)),
+        "consistency": honest.as_json() if honest else None,
+    }
+
+
+def _estimates(run: Run, initial: bool) -> tuple[Array, Array, NDArray[Any]]:
+    """Pose (n, 4, 4), planar covariance (n, 3, 3) and status of every frame of the run."""
+    n = len(run.frames)
+    covariance = np.zeros((n, 3, 3))
+    covariance[:, range(3), range(3)] = run.frames.sigma**2
+    if initial or run.poses is None:
+        return run.frames.initial, covariance, np.full(n, "ok", object)
+    status = np.full(n, "no-match", object)
+    row = {int(f): i for i, f in enumerate(run.frames.frame)}
+    for k, frame in enumerate(run.poses.frame.tolist()):
+        if frame in row:
+            status[row[frame]] = run.poses.status[k]
+            covariance[row[frame]] = run.poses.covariance[k][np.ix_(PLANAR, PLANAR)]
+    return run.best_poses(), covariance, status
+
+
+def judge_pairs(path: Path, truth: str | Path) -> dict[str, dict[str, Any]]:
+    """Cases of ``{"cases": [{"name", "frames": [{"true", "est"}]}]}``, each summarized.
+
+    Poses are {"x", "y", "yaw"} (m, rad) or {"t", "q"} (m, unit quaternion w, x, y, z). The true
+    poses are those of the file ``truth``, case by case.
+    """
+    estimates, truths = _cases(path), _cases(Path(truth))
+    out = {}
+    for name, frames in estimates.items():
+        if name not in truths or len(truths[name]) != len(frames):
+            raise BadInput(truth, f"case {name} is missing or has another number of frames")
+        estimated = np.array([_pose(path, name, f, "est") for f in frames])
+        true = np.array([_pose(Path(truth), name, f, "true") for f in truths[name]])
+        out[name] = summarize(pose_errors(true, estimated))
+    return out
+
+
+def _cases(path: Path) -> dict[str, list[Any]]:
+    data = read_json(path)
+    cases = data.get("cases") if isinstance(data, dict) else None
+    if not isinstance(cases, list) or not all(isinstance(c, dict) for c in cases):
+        raise BadInput(path, "holds no cases of pose pairs", "see docs/evaluate.md")
+    if not all(isinstance(c.get("frames"), list) and c["frames"] for c in cases):
+        raise BadInput(path, "a case has no frames")
+    return {str(c.get("name", k)): c["frames"] for k, c in enumerate(cases)}
+
+
+def _pose(path: Path, case: str, frame: Any, key: str) -> Array:
+    try:
+        p = frame[key]
+        if "yaw" in p:
+            pose = se3_from_xyyaw(p["x"], p["y"], p["yaw"])
+        else:
+            pose = se3_from_quaternion(np.array(p["q"], float), np.array(p["t"], float))
+    except (KeyError, TypeError, ValueError):
+        raise BadInput(path, f"case {case}: a frame has no pose {key}") from None
+    if not np.isfinite(pose).all():
+        raise BadInput(path, f"case {case}: a pose is not finite")
+    return pose
+
+
+def judge_changes(
+    predicted: str | Path,
+    truth: str | Path,
+    min_probability: float = 0.0,
+    drives: Sequence[Drive] = (),
+    km: float | None = None,
+) -> dict[str, Any]:
+    """Element-level precision and recall; with ``drives`` also per km and frame by frame."""
+    pred_file, true_file = read_changes(predicted), read_changes(truth)
+    found, crs = in_metres([pred_file, true_file], drives[0].crs if drives else None)
+    pred, true = ([c for c in side if c.kind in KINDS] for side in found)
+    pred = [c for c in pred if c.probability >= min_probability]
+    score = score_changes(pred, true, _area(true_file, crs))
+    km = km if km is not None else (sum(d.kilometres for d in drives) or None)
+    result = score.as_json(km)
+    result["not_judged"] = len(found[1]) - len(true)
+    result["by_kind_and_class"] = _breakdown(score)
+    result["changes"] = _listing(score)
+    if drives:
+        xy = np.concatenate([d.pose[:, :2, 3] for d in drives])
+        truly = changed_frames(xy, [c.points for c in true])
+        answers = changed_frames(xy, [c.points for c in pred])
+        result["frame_level"] = {
+            "protocol": f"TbV, all frames, changes nearer than {FRAME_RANGE:g} m",
+            **frame_accuracy(truly, answers),
+        }
+    return result
+
+
+def in_metres(files: list[ChangeFile], crs: str | None) -> tuple[list[list[Change]], str | None]:
+    """The changes of files in one projected CRS (default: the UTM zone of the first change)."""
+    lonlat = [c.lonlat for file in files for c in file.changes]
+    if crs is None and lonlat:
+        crs = utm_crs(*np.concatenate(lonlat).mean(axis=0).tolist())
+    out = []
+    for file in files:
+        changes = []
+        for c in file.changes:
+            points = lonlat_to(str(crs), c.lonlat)
+            changes.append(
+                Change(c.kind, c.class_name, points, c.probability, c.change_id, c.element_id)
+            )
+        out.append(changes)
+    return out, crs
+
+
+def _area(file: ChangeFile, crs: str | None) -> Any | None:
+    import shapely
+
+    if file.area is None or crs is None:
+        return None
+    # Rings of one polygon and of many alike: holes are what is covered an even number of times.
+    area = shapely.Polygon()
+    for ring in file.area:
+        area = area.symmetric_difference(shapely.Polygon(lonlat_to(crs, ring)).buffer(0))
+    return area
+
+
+def _breakdown(score: ChangeScore) -> dict[str, dict[str, int]]:
+    out: dict[str, dict[str, int]] = {}
+    rows = [(t, "found") for _, t in score.found]
+    rows += [(c, "missed") for c in score.missed] + [(c, "false") for c in score.false]
+    for change, verdict in rows:
+        name = f"{change.kind} {change.class_name}"
+        out.setdefault(name, {"found": 0, "missed": 0, "false": 0})[verdict] += 1
+    return dict(sorted(out.items()))
+
+
+def _listing(score: ChangeScore) -> list[dict[str, Any]]:
+    rows: list[tuple[str, Change | None, Change | None]] = []
+    rows += [("found", p, t) for p, t in score.found]
+    rows += [("false", p, None) for p in score.false]
+    rows += [("missed", None, t) for t in score.missed]
+    out = []
+    for verdict, p, t in rows:
+        either = p or t
+        assert either is not None
+        out.append(
+            {
+                "verdict": verdict,
+                "kind": either.kind,
+                "class": either.class_name,
+                "change_id": p.change_id if p else None,
+                "element_id": (t or either).element_id or None,
+                "probability": p.probability if p else None,
+            }
+        )
+    return out
+
+
+def judge_scenes(predicted: str | Path, truth: str | Path) -> dict[str, Any]:
+    """TbV's accuracies of ``{"scenes": [{"events", "frames"}]}``: answers from one file, truth
+    (events and ego positions) from the other; all frames of all scenes are pooled."""
+    answers, scenes = read_scenes(predicted), read_scenes(truth)
+    if [len(s["frames"]) for s in answers] != [len(s["frames"]) for s in scenes]:
+        raise BadInput(predicted, f"its scenes or frames are not those of {truth}")
+    truly, said = [np.zeros(0, bool)], [np.zeros(0, bool)]
+    try:
+        for scene, answer in zip(scenes, answers, strict=True):
+            xy = np.array([f["ego_xy"] for f in scene["frames"]], float).reshape(-1, 2)
+            events = [_event(e) for e in scene["events"]]
+            truly.append(changed_frames(xy, events))
+            said.append(np.array([bool(f["predicted_changed"]) for f in answer["frames"]]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadInput(
+            truth, f"a scene lacks something ({error})", "see docs/evaluate.md"
+        ) from None
+    return frame_accuracy(np.concatenate(truly), np.concatenate(said))
+
+
+def read_scenes(path: str | Path) -> list[dict[str, Any]]:
+    """The scenes of a file; BadInput when it has none."""
+    data = read_json(path)
+    scenes = data.get("scenes") if isinstance(data, dict) else None
+    if not isinstance(scenes, list):
+        raise BadInput(path, "holds no scenes", "see docs/evaluate.md")
+    if not all(isinstance(s, dict) and isinstance(s.get("frames"), list) for s in scenes):
+        raise BadInput(path, "a scene has no frames")
+    return scenes
+
+
+def _event(event: dict[str, Any]) -> Array:
+    points = np.array(event["points"], float)
+    closed = event["kind"] == "polygon" and (points[0] != points[-1]).any()
+    return np.concatenate([points, points[:1]]) if closed else points
