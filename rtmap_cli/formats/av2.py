@@ -27,10 +27,13 @@ from rtmap_cli.formats.av2_files import (
     timed_files,
 )
 from rtmap_cli.formats.av2_ground import GroundHeight, read_ground
+from rtmap_cli.formats.av2_map import read_av2_archive, read_av2_map, vector_map_of
 from rtmap_cli.geometry.poses import interpolate, invert, yaw_of
 from rtmap_cli.logs.log import Frame, Occluder
 from rtmap_cli.logs.native import decode_image
-from rtmap_cli.maps.crs import city_crs
+from rtmap_cli.maps.crs import city_code, city_crs
+
+__all__ = ["Av2Log", "read_av2_archive", "read_av2_map", "vector_map_of"]
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -65,7 +68,7 @@ class Av2Log:
         if not self.path.is_dir():
             raise BadInput(self.path, "no such log folder")
         self.log_id = self.path.resolve().name
-        self.city = city or find_city(self.path) or _no_city(self.path)
+        self.city = city_code(city or find_city(self.path) or _no_city(self.path), self.path)
         self.crs, self.origin = city_crs(self.city, self.path)
         self.ground_z = GROUND_Z
         self.pose_times, city_SE3_ego = read_poses(self.path)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.poses import se3_from_quaternion
 from rtmap_cli.logs.log import Camera, Rig
-from rtmap_cli.maps.crs import CITY_ORIGINS
+from rtmap_cli.maps.crs import city_code
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -236,9 +236,5 @@ def find_city(folder: Path) -> str | None:
     for path in sorted((folder / "map").glob("*")) if (folder / "map").is_dir() else ():
         found = re.search(r"____([A-Za-z]{3})(?=[_.])", path.name)
         if found:
-            code = found.group(1).upper()
-            if code not in CITY_ORIGINS:
-                known = ", ".join(CITY_ORIGINS)
-                raise BadInput(path, f"unknown city {code!r}", f"known cities are {known}")
-            return code
+            return city_code(found.group(1), path)
     return None

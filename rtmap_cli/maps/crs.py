@@ -151,18 +151,22 @@ def to_lonlat(crs: str, xy: Array) -> Array:
     return convert(crs, WGS84, xy)
 
 
-def city_crs(city: str, where: str | Path = "city") -> tuple[str, Array]:
-    """UTM CRS of an Argoverse 2 city and its origin (easting, northing) in metres.
-
-    City coordinates + origin = UTM coordinates (WGS84, north); heights stay as they are.
-    ``city`` is the three-letter code or the name that forecasting scenarios use.
-    """
+def city_code(city: str, where: str | Path = "city") -> str:
+    """The three-letter code of a city (code or name as in scenarios); BadInput lists the known."""
     code = CITY_NAMES.get(city.lower(), city.upper())
     if code not in CITY_ORIGINS:
         raise BadInput(
             where, f"unknown city {city!r}", f"known cities are {', '.join(CITY_ORIGINS)}"
         )
-    crs, latitude, longitude = CITY_ORIGINS[code]
+    return code
+
+
+def city_crs(city: str, where: str | Path = "city") -> tuple[str, Array]:
+    """UTM CRS of an Argoverse 2 city and its origin (easting, northing) in metres.
+
+    City coordinates + origin = UTM coordinates (WGS84, north); heights stay as they are.
+    """
+    crs, latitude, longitude = CITY_ORIGINS[city_code(city, where)]
     return crs, lonlat_to(crs, np.array([longitude, latitude]))
 
 
