@@ -41,3 +41,16 @@ quiet: Decorator = click.option("-q", "--quiet", is_flag=True, help="No progress
 threads: Decorator = click.option(
     "--threads", type=click.IntRange(1), help="Threads (default: the processor's cores)."
 )
+class_names: Decorator = click.option(
+    "--class", "class_names", multiple=True, metavar="NAME", help="Only this class (repeatable)."
+)
+bbox: Decorator = click.option(
+    "--bbox",
+    type=float,
+    nargs=4,
+    metavar="X0 Y0 X1 Y1",
+    help="Only elements whose bounding box touches this one (map frame, metres).",
+)
+lonlat: Decorator = click.option(
+    "--lonlat", is_flag=True, help="--bbox is west south east north in WGS84 degrees."
+)

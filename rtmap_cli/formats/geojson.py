@@ -61,12 +61,12 @@ def read_geojson(path: str | Path, crs: str | None = None) -> VectorMap:
     xyz = np.column_stack([lonlat_to(crs, lonlat[:, :2]), lonlat[:, 2]])
     elements: list[Element] = []
     used = 0
-    for feature, name, group in zip(features, names, parts, strict=True):
+    for item, name, group in zip(features, names, parts, strict=True):
         for k, part in enumerate(group):
             points = xyz[used : used + len(part.lonlat)]
             used += len(part.lonlat)
             suffix = f"-{k}" if len(group) > 1 else ""
-            elements.append(_element(feature, name, suffix, part, points, (source, crs), path))
+            elements.append(_element(item, name, suffix, part, points, (source, crs), path))
     seen: set[str] = set()
     for element in elements:
         if element.element_id in seen:

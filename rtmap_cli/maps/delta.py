@@ -183,6 +183,12 @@ def element_count(table: Any) -> int:
 
 def read_tile(place: Place, name: str, bbox: Box | None = None) -> pa.Table:
     """The rows of one tile whose bounding boxes touch ``bbox``."""
+    if not place.exists(name):
+        raise BadInput(
+            place.file(name),
+            "this tile is missing",
+            "copy the map again, or read a version that `rtmap map gc --keep` left whole",
+        )
     table = read_table(place.file(name), TILE)
     if bbox is None or table.num_rows == 0:
         return table
