@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from pathlib import Path
 
@@ -11,70 +10,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from sample_logs import jpeg, rewrite, small_rig, write_native_log
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.geometry.poses import se3_from_xyyaw
-from rtmap_cli.logs.log import Camera, Frame, Occluder, Rig
+from rtmap_cli.logs.log import Camera, Frame, Rig
 from rtmap_cli.logs.native import NativeLog, NativeLogWriter, paths_inside
 from rtmap_cli.logs.open import open_log
-from rtmap_cli.logs.run import true_poses
 from rtmap_cli.tables import whole_folder
-
-FORWARD = np.array([[0, 0, 1, 1.6], [-1, 0, 0, 0], [0, -1, 0, 1.4], [0, 0, 0, 1.0]])
-
-
-def rig(count: int = 2) -> Rig:
-    k = np.array([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
-    turn = [se3_from_xyyaw(0.0, 0.0, a) for a in np.arange(count) * 0.9]
-    return Rig(
-        tuple(Camera(f"cam_{i}", 64, 48, k, t @ FORWARD, (0.1, 0, 0)) for i, t in enumerate(turn))
-    )
-
-
-def jpeg(value: int, size: tuple[int, int] = (64, 48)) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(np.full((size[1], size[0], 3), value, np.uint8)).save(buffer, "JPEG")
-    return buffer.getvalue()
-
-
-def write_log(folder: Path, frames: int = 4, cameras: int = 2) -> Path:
-    """A small log: frame 1 lacks a camera, frame 2 has all, occluder and sweep in frame 0."""
-    pose = se3_from_xyyaw(583_000.0 + 2.5 * np.arange(frames), 4_477_000.0, 0.1, 30.0)
-    times = 1_700_000_000_000_000_000 + 500_000_000 * np.arange(frames)
-    with whole_folder(folder) as temporary:
-        writer = NativeLogWriter(temporary, "drive-1", "EPSG:32617", rig(cameras), -0.3)
-        for i in range(frames):
-            frame = Frame(
-                index=i,
-                timestamp_ns=int(times[i]),
-                map_SE3_ego=pose[i],
-                sigma=np.array([0.8, 0.8, 0.02]),
-                odometry=None if i == 0 else np.array([2.5, 0.0, 0.0]),
-                odometry_sigma=None if i == 0 else np.array([0.02, 0.01, 0.001]),
-                occluders=(Occluder(9.0, 2.0, 0.1, 4.5, 1.8),) if i == 0 else (),
-            )
-            names = [f"cam_{k}" for k in range(1 if i == 1 else cameras)]
-            sweep = np.arange(12, dtype=float).reshape(3, 4) if i == 0 else None
-            writer.add(frame, {n: jpeg(40 * i + 10) for n in names}, sweep=sweep)
-        writer.write_truth(true_poses(np.arange(frames), times, pose), {"changes": []})
-        writer.close()
-    return folder
 
 
 @pytest.fixture
 def log_folder(tmp_path: Path) -> Path:
-    return write_log(tmp_path / "log")
-
-
-def rewrite(path: Path, /, **columns: list[object]) -> None:
-    """Replace columns of a table, metadata kept."""
-    table = pq.read_table(path)
-    for name, values in columns.items():
-        k = table.schema.names.index(name)
-        table = table.set_column(k, table.schema.field(k), pa.array(values, table.schema.types[k]))
-    pq.write_table(table, path)
+    return write_native_log(tmp_path / "log")
 
 
 def test_round_trip(log_folder: Path) -> None:
@@ -82,7 +29,7 @@ def test_round_trip(log_folder: Path) -> None:
     assert isinstance(log, NativeLog)
     assert (log.log_id, log.crs, log.ground_z, len(log)) == ("drive-1", "EPSG:32617", -0.3, 4)
     assert log.rig is not None
-    for camera, expected in zip(log.rig, rig(), strict=True):
+    for camera, expected in zip(log.rig, small_rig(), strict=True):
         np.testing.assert_allclose(camera.intrinsics, expected.intrinsics)
         np.testing.assert_allclose(camera.ego_SE3_camera, expected.ego_SE3_camera, atol=1e-12)
         assert camera.distortion == expected.distortion
@@ -97,7 +44,9 @@ def test_round_trip(log_folder: Path) -> None:
     image = log.read_image(frames[2], "cam_1")
     assert image.shape == (48, 64, 3)
     assert abs(int(image[5, 5, 0]) - 90) <= 2
-    np.testing.assert_allclose(log.read_sweep(frames[0]), np.arange(12).reshape(3, 4))
+    np.testing.assert_allclose(
+        log.read_sweep(frames[0]), np.arange(12).reshape(3, 4) / 12, atol=1e-7
+    )
     assert log.read_sweep(frames[1]) is None
     truth = log.truth_poses()
     assert truth is not None and truth.method == "truth"
@@ -112,7 +61,7 @@ def test_same_content_same_bytes(tmp_path: Path) -> None:
             if p.is_file()
         }
 
-    assert digests(write_log(tmp_path / "a")) == digests(write_log(tmp_path / "b"))
+    assert digests(write_native_log(tmp_path / "a")) == digests(write_native_log(tmp_path / "b"))
 
 
 def test_tables_state_frame_units_and_crs(log_folder: Path) -> None:
@@ -239,7 +188,7 @@ def test_writer_refuses_nonsense(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="folder name"):
         camera = Camera("../x", 4, 4, np.eye(3), np.eye(4))
         NativeLogWriter(tmp_path, "a", "EPSG:32617", Rig((camera,)))
-    writer = NativeLogWriter(tmp_path, "a", "EPSG:32617", rig())
+    writer = NativeLogWriter(tmp_path, "a", "EPSG:32617", small_rig())
     with pytest.raises(ValueError, match="at least one frame"):
         writer.close()
     writer.add(frame, {})
