@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.tables import whole_file
@@ -38,7 +38,10 @@ class Place:
         return str(self.root.absolute())
 
     def file(self, name: str) -> Path:
-        """The path of a file inside."""
+        """The path of a file inside; BadInput for a name that leads out of the map."""
+        # Names come from the log of a map that somebody else may have written.
+        if PurePosixPath(name).is_absolute() or ".." in name.split("/") or ":" in name:
+            raise BadInput(self.root, f"its log names {name!r}, which is not inside the map")
         return self.root / name
 
     def exists(self, name: str) -> bool:

@@ -1,0 +1,188 @@
+"""The JSON and GeoJSON files of rtmap as JSON Schema (draft 2020-12)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rtmap_cli.formats.geojson import GEOJSON_SCHEMA, GEOJSON_VERSION
+from rtmap_cli.logs.run import RUN_SCHEMA, RUN_VERSION
+from rtmap_cli.logs.tables import LOG_SCHEMA, LOG_VERSION
+from rtmap_cli.maps.delta import MAP_FORMAT, MAP_VERSION
+
+DRAFT = "https://json-schema.org/draft/2020-12/schema"
+
+Node = dict[str, Any]
+
+
+def _text(description: str) -> Node:
+    return {"type": "string", "description": description}
+
+
+def _number(description: str) -> Node:
+    return {"type": "number", "description": description}
+
+
+def _integer(description: str) -> Node:
+    return {"type": "integer", "description": description}
+
+
+def _numbers(description: str) -> Node:
+    return {"type": "array", "items": {"type": ["number", "null"]}, "description": description}
+
+
+def _texts(description: str) -> Node:
+    return {"type": "array", "items": {"type": "string"}, "description": description}
+
+
+def _or_null(node: Node) -> Node:
+    return node | {"type": [node["type"], "null"]}
+
+
+def _object(properties: Node, required: list[str], description: str = "", **more: Any) -> Node:
+    out: Node = {"type": "object", "properties": properties, "required": required, **more}
+    return out | ({"description": description} if description else {})
+
+
+def _versioned(name: str, version: str) -> Node:
+    return {
+        "schema": {"const": name},
+        "schema_version": {
+            "type": "string",
+            "description": f"major.minor; this is {version}, readers refuse another major version",
+        },
+    }
+
+
+def _document(title: str, file: str, node: Node) -> Node:
+    return {"$schema": DRAFT, "title": title, "file": file, **node}
+
+
+def _run() -> Node:
+    span = {"type": "array", "items": {"type": "number"}, "description": "minimum, maximum, m"}
+    properties = _versioned(RUN_SCHEMA, RUN_VERSION) | {
+        "rtmap_version": _text("the rtmap that wrote it"),
+        "log_id": _text("identity of the traversal"),
+        "crs": _text("CRS of all poses and map-frame points of the run"),
+        "classes": _texts("classes, in the order of the model's indices"),
+        "range_m": _object({"x": span, "y": span}, ["x", "y"], "ego-frame range"),
+        "ego_frame": _text("x forward, y left, z up, metres"),
+    }
+    description = "How a run was made; further members say by what (model, options, map_version …)."
+    return _document(RUN_SCHEMA, "RUN/run.json", _object(properties, list(properties), description))
+
+
+def _log() -> Node:
+    properties = _versioned(LOG_SCHEMA, LOG_VERSION) | {
+        "log_id": _text("identity of the drive"),
+        "crs": _text("CRS of its poses"),
+        "ground_z": _number("height of the road under the vehicle in the ego frame, m"),
+        "ego_frame": _text("what the axes of the ego frame are"),
+        "map_frame": _text("what the axes of the map frame are"),
+        "camera_frame": _text("what the axes of a camera frame are"),
+        "time": _text("what timestamps count"),
+        "creation": {"type": "object", "description": "who made it and how"},
+    }
+    required = ["schema", "schema_version", "log_id", "crs", "ground_z"]
+    return _document(
+        LOG_SCHEMA, "LOG/log.json", _object(properties, required, "What a native log is.")
+    )
+
+
+def _geometry(*kinds: str) -> Node:
+    properties = {
+        "type": {"enum": list(kinds)},
+        "coordinates": {"type": "array", "description": "WGS84 longitude, latitude, height (m)"},
+    }
+    return _object(properties, ["type", "coordinates"])
+
+
+def _collection(properties: Node, required: list[str], geometry: Node, **members: Node) -> Node:
+    feature = _object(
+        {
+            "type": {"const": "Feature"},
+            "properties": _object(properties, required),
+            "geometry": geometry,
+        },
+        ["type", "properties", "geometry"],
+    )
+    return _object(
+        {
+            "type": {"const": "FeatureCollection"},
+            "features": {"type": "array", "items": feature},
+            **members,
+        },
+        ["type", "features"],
+    )
+
+
+def _map_geojson() -> Node:
+    own = _object(
+        _versioned(GEOJSON_SCHEMA, GEOJSON_VERSION)
+        | {
+            "crs_of_map": _text("CRS of the map it was exported from"),
+            "map_version": _or_null(_integer("version of that map")),
+            "frame": _text("what the coordinates are"),
+            "units": _text("units of the properties"),
+        },
+        ["schema", "schema_version", "crs_of_map"],
+        "written by `rtmap export geojson`; other files need not have it",
+    )
+    properties = {
+        "id": _text("element_id"),
+        "class": _text("class of the element"),
+        "sigma_m": _numbers("standard deviation per vertex, each horizontal axis, m"),
+        "covariance_m2": {
+            "type": "array",
+            "items": _numbers("xx, xy, yy, zz"),
+            "description": "covariance per vertex, m², axes of crs_of_map; null: unknown",
+        },
+        "existence": _number("log-odds that the element exists"),
+        "seen": _integer("frames in which it was seen"),
+        "in_view": _integer("frames in which it was in view"),
+        "traversals": _integer("drives that had it in view"),
+        "first_seen_ns": _or_null(_integer("ns since 1970-01-01T00:00:00Z")),
+        "last_seen_ns": _or_null(_integer("ns since 1970-01-01T00:00:00Z")),
+        "runs": _texts("ids of the runs behind it"),
+        "model_sha256": _text("SHA-256 of the network that saw it"),
+        "attributes": {"type": "object", "description": "attributes with a name of this list"},
+    }
+    node = _collection(properties, ["class"], _geometry("LineString", "Polygon"), rtmap=own)
+    return _document(GEOJSON_SCHEMA, "what `rtmap export geojson` writes", node)
+
+
+def _changes_geojson() -> Node:
+    properties = {
+        "change_id": _text("id of the change"),
+        "kind": {"enum": ["insert", "delete", "modify"], "description": "seen from the map"},
+        "class": _text("class of the element"),
+        "element_id": _or_null(_text("map element that is gone or modified")),
+        "probability": _number("that the change is real"),
+        "frames_seen": _integer("frames that support it"),
+        "frames_in_view": _integer("frames that could have seen it"),
+        "traversals_seen": _integer("drives that support it"),
+        "traversals_in_view": _integer("drives that could have seen it"),
+        "first_seen_ns": _or_null(_integer("ns since 1970-01-01T00:00:00Z")),
+        "last_seen_ns": _or_null(_integer("ns since 1970-01-01T00:00:00Z")),
+        "runs": _texts("ids of the runs behind it"),
+    }
+    node = _collection(properties, list(properties), _geometry("LineString", "Polygon"))
+    return _document("rtmap.changes.geojson", "what `rtmap detect-changes` writes", node)
+
+
+def _map_properties() -> Node:
+    properties = {
+        "format": {"const": MAP_FORMAT},
+        "version": _text(f"major.minor; this is {MAP_VERSION}"),
+        "crs": _text("CRS of the map frame: projected, metres"),
+        "tile_zoom": _integer("web-mercator zoom of the quadkeys"),
+    }
+    description = "The JSON text in the description of the Delta table."
+    return _document(
+        MAP_FORMAT, "MAP/_delta_log", _object(properties, list(properties), description)
+    )
+
+
+def documents() -> dict[str, Node]:
+    """Schema name → JSON Schema."""
+    found = [_run(), _log(), _map_geojson(), _changes_geojson(), _map_properties()]
+    return {node["title"]: node for node in found}
