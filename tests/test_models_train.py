@@ -1,0 +1,238 @@
+"""Train on a painted road, resume, export, and run the ONNX file: a whole life in seconds."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="torch is not installed (extra: train)")
+pytest.importorskip("onnxscript", reason="onnxscript is not installed (extra: train)")
+cv2 = pytest.importorskip("cv2", reason="opencv is not installed (extra: train)")
+
+import onnx  # noqa: E402
+import onnxruntime  # noqa: E402
+from rtmap_models.bev import normalize_picture  # noqa: E402
+from rtmap_models.checkpoint import load_checkpoint, load_network  # noqa: E402
+from rtmap_models.config import CONFIGS, load_config  # noqa: E402
+from rtmap_models.criterion import LossWeights, compute_losses  # noqa: E402
+from rtmap_models.dataset import (  # noqa: E402
+    Frames,
+    collate,
+    make_sample,
+    window_half,
+    window_size,
+    write_shard,
+)
+from rtmap_models.export import OUTPUTS, example_inputs, parity  # noqa: E402
+from rtmap_models.matcher import Matcher  # noqa: E402
+from rtmap_models.network import RTMapNet  # noqa: E402
+from rtmap_models.samples import Scene  # noqa: E402
+from rtmap_models.train import TrainOptions, train  # noqa: E402
+
+from rtmap_cli.errors import BadInput  # noqa: E402
+
+TINY = {
+    "cell_m = 0.25": "cell_m = 0.75",
+    "supersample = 2": "supersample = 1",
+    "[24, 48, 96, 128]": "[8, 8, 16, 16]",
+    "fine_width = 24": "fine_width = 8",
+    "coarse_width = 64": "coarse_width = 16",
+    "query_width = 128": "query_width = 32",
+    "point_width = 48": "point_width = 16",
+    "layers = 3": "layers = 1",
+    "new_queries = 50": "new_queries = 12",
+    "[128, 224]": "[32, 48]",
+    'name = "rtmap-tiny"': 'name = "rtmap-test"',
+}
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The default configuration with every size cut down."""
+    text = (CONFIGS / "rtmap-tiny.toml").read_text()
+    for old, new in TINY.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path_factory.mktemp("config") / "test.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(scope="module")
+def frames(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve painted frames: a straight road of two lanes, some with a crossing."""
+    config, rng = load_config(tiny), np.random.default_rng(0)
+    (rows, columns), half = window_size(config), np.array(window_half(config))
+    pictures = np.full((12, rows, columns, 4), 60, np.uint8)
+    scenes = []
+    for picture in pictures:
+        y = rng.uniform(-4, 4)
+        lines = [
+            (2, np.array([[-60, y - 6], [60, y - 6]])),
+            (2, np.array([[-60, y + 6], [60, y + 6]])),
+        ]
+        lines.append((1, np.array([[-60, y], [60, y]])))
+        if rng.random() < 0.5:
+            x = rng.uniform(-20, 20)
+            ring = [[x, y - 6], [x + 4, y - 6], [x + 4, y + 6], [x, y + 6], [x, y - 6]]
+            lines.append((0, np.array(ring)))
+        canvas = np.ascontiguousarray(picture)
+        for _, p in lines:
+            pixel = np.round((p + half) / config.cell_m - 0.5).astype(np.int32)
+            cv2.polylines(canvas, [pixel], False, (220, 220, 220, 200))
+        picture[...] = canvas
+        offsets = np.cumsum([0] + [len(p) for _, p in lines])
+        classes = np.array([c for c, _ in lines])
+        scenes.append(Scene(np.concatenate([p for _, p in lines]), offsets, classes))
+    folder = tmp_path_factory.mktemp("frames")
+    write_shard(folder, "painted", pictures, scenes, {})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def weights(tiny: Path, frames: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sixty steps of training."""
+    path = tmp_path_factory.mktemp("weights") / "weights.pt"
+    options = TrainOptions(frames, path, steps=60, warmup=10, log_every=20, bf16=False, rate=3e-3)
+    train(load_config(tiny), options)
+    return path
+
+
+@pytest.fixture(scope="module")
+def model(weights: Path) -> Path:
+    """The trained weights, exported by the command line."""
+    from rtmap_cli.cli import run
+
+    path = weights.with_name("model.onnx")
+    assert run(["export-model", str(weights), "-o", str(path), "--name", "test-model"]) == 0
+    return path
+
+
+def test_losses_fall(weights: Path) -> None:
+    rows = [line.split(",") for line in weights.with_suffix(".csv").read_text().splitlines()]
+    losses = [float(row[rows[0].index("points")]) for row in rows[1:]]
+    assert len(losses) == 3 and losses[-1] < 0.8 * losses[0]
+
+
+def test_matched_queries_are_one_to_one(tiny: Path, frames: Path) -> None:
+    config, rng = load_config(tiny), np.random.default_rng(0)
+    data = Frames(frames, config)
+    batch = collate([make_sample(data[k], config, rng, prior="none") for k in range(4)], config)
+    network = RTMapNet(config).eval()
+    prediction = network.predict(
+        normalize_picture(batch.picture), batch.prior_points, batch.prior_class, batch.prior_mask
+    )
+    match = Matcher(batch)(prediction.layers[-1], prediction.new_count)
+    assert sorted(match.truth) == list(range(len(batch.truth_class)))
+    assert len(set(zip(match.sample, match.query, strict=True))) == len(match.query)
+    parts = compute_losses(prediction, batch, LossWeights())
+    assert all(torch.isfinite(v) for v in parts.values())
+
+
+def test_a_hidden_prior_does_not_reach_the_new_queries(weights: Path) -> None:
+    network, _ = load_network(weights)
+    _, _, *prior = example_inputs(network.config, 2, 3, 5)
+    picture = torch.randn(2, 4, *network.config.picture_size)
+    empty = (torch.zeros_like(prior[0]), prior[1], torch.zeros_like(prior[2]))
+    with torch.no_grad():
+        alone = network.predict(picture, *empty).layers[-1].points[:, :12]
+        hidden = network.predict(picture, *prior, torch.zeros(2)).layers[-1].points[:, :12]
+        seen = network.predict(picture, *prior, torch.ones(2)).layers[-1].points[:, :12]
+    assert torch.allclose(alone, hidden, atol=1e-4)
+    assert not torch.allclose(alone, seen, atol=1e-4)
+
+
+def test_export_runs_at_any_size_and_equals_torch(model: Path, weights: Path) -> None:
+    network, _ = load_network(weights)
+    worst = parity(network, model, ((1, 7, 9), (3, 2, 1), (2, 8, 50)))
+    assert max(worst.values()) < 1e-3
+    session = onnxruntime.InferenceSession(str(model))
+    inputs = example_inputs(network.config, 2, 6, 4)
+    names = [i.name for i in session.get_inputs()]
+    out = session.run(list(OUTPUTS), dict(zip(names, [x.numpy() for x in inputs], strict=True)))
+    shapes = [o.shape for o in out]
+    assert shapes == [(2, 16, 3), (2, 16, 20, 2), (2, 16, 20, 2), (2, 4), (2, 3), (2, 3, 3)]
+    unused = inputs[4].numpy() == 0
+    assert (out[3][unused] == 0).all() and (out[0][:, 12:][unused] == 0).all()
+
+
+def test_export_describes_itself(model: Path) -> None:
+    session = onnxruntime.InferenceSession(str(model))
+    meta = session.get_modelmeta().custom_metadata_map
+    assert meta["rtmap.model_name"] == "test-model"
+    assert json.loads(meta["rtmap.classes"]) == ["ped_crossing", "divider", "boundary"]
+    assert json.loads(meta["rtmap.range_m"]) == {"x": [-36.0, 36.0], "y": [-18.0, 18.0]}
+    assert meta["rtmap.sigma"] == "standard deviation, metres"
+    for key in ("model_version", "axis_order", "units", "vertex_count", "prior_slots", "horizon"):
+        assert meta[f"rtmap.{key}"]
+    for key in ("image_size", "training_data", "licence", "code_sha"):
+        assert meta[f"rtmap.{key}"]
+    graph = onnx.load(model)
+    assert {node.domain for node in graph.graph.node} == {""}
+    raw = model.read_bytes()
+    assert str(Path(__file__).parents[1]).encode() not in raw and b"site-packages" not in raw
+
+
+def test_export_refuses_to_overwrite(rtmap, model: Path, weights: Path) -> None:
+    rtmap("export-model", weights, "-o", model, code=2)
+
+
+def test_resume_goes_on(tiny: Path, frames: Path, weights: Path, tmp_path: Path) -> None:
+    path = tmp_path / "more.pt"
+    options = TrainOptions(frames, path, steps=62, resume=weights, bf16=False)
+    train(load_config(tiny), options)
+    assert load_checkpoint(path)[1]["step"] == 62
+
+
+def test_two_workers_agree(tiny: Path, frames: Path, tmp_path: Path) -> None:
+    path = tmp_path / "two.pt"
+    call = ["train", "-o", path, "--config", tiny, "--data", frames, "--steps", 3, "--batch", 2]
+    done = subprocess.run(
+        [sys.executable, "-m", "rtmap_cli", *map(str, call), "--threads", "2"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    content = load_checkpoint(path)[1]
+    assert content["step"] == 3 and content["samples"] == 12
+
+
+def test_bad_weights(rtmap, tmp_path: Path, frames: Path, tiny: Path) -> None:
+    missing = rtmap("export-model", tmp_path / "no.pt", "-o", tmp_path / "m.onnx", code=3)
+    assert "no such file" in missing.err
+    (tmp_path / "text.pt").write_text("hello")
+    rtmap("export-model", tmp_path / "text.pt", "-o", tmp_path / "m.onnx", code=3)
+    torch.save({"a": 1}, tmp_path / "other.pt")
+    other = rtmap("export-model", tmp_path / "other.pt", "-o", tmp_path / "m.onnx", code=3)
+    assert "not a checkpoint" in other.err
+    assert not (tmp_path / "m.onnx").exists()
+    rtmap("train", "-o", tmp_path / "w.pt", code=2)
+    rtmap("train", "-o", tmp_path / "w.pt", "--steps", 1, "--data", tmp_path / "none", code=3)
+    (tmp_path / "bad.toml").write_text("name = 'x'")
+    rtmap("train", "-o", tmp_path / "w.pt", "--steps", 1, "--config", tmp_path / "bad.toml", code=3)
+
+
+def test_damaged_shard(tiny: Path, frames: Path, tmp_path: Path) -> None:
+    for file in frames.iterdir():
+        (tmp_path / file.name).write_bytes(
+            file.read_bytes()[: 200 if file.suffix == ".npy" else None]
+        )
+    with pytest.raises(BadInput, match="unreadable shard"):
+        Frames(tmp_path, load_config(tiny))
+
+
+def test_zoo_needs_no_torch() -> None:
+    code = (
+        "import sys; import rtmap_models.zoo as z; print(z.names());"
+        "assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    from rtmap_models import zoo
+
+    with pytest.raises(FileNotFoundError, match="no model named"):
+        zoo.model_path("no-such-model")
