@@ -29,8 +29,9 @@ def command(run: Path, truth: str, traversal: str | None, initial: bool, as_json
     Example:
       rtmap evaluate poses runs/drive-00 --truth logs/drive-00
     """
+    from rtmap_cli.logs.run import read_run
     from rtmap_cli.output import emit
-    from rtmap_cli.steps.evaluate.judge import judge_pairs, judge_run
+    from rtmap_cli.steps.evaluate.judge import judge_pairs, judge_poses
 
     if run.name.endswith((".json", ".json.gz")):
         cases = judge_pairs(run, truth)
@@ -38,7 +39,7 @@ def command(run: Path, truth: str, traversal: str | None, initial: bool, as_json
             {"cases": cases}, as_json, [line for n, c in cases.items() for line in [n, *_lines(c)]]
         )
         return
-    result = judge_run(run, truth, traversal, initial)
+    result = judge_poses(read_run(run), truth, traversal, initial).as_json()
     emit(result, as_json, _lines(result))
 
 

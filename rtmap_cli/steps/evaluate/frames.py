@@ -19,7 +19,7 @@ from rtmap_cli.steps.evaluate.precision import Detection
 
 Array = NDArray[np.float64]
 
-MIN_LENGTH = 0.5
+MIN_LENGTH = 0.3
 """Pieces of lines that a crop leaves shorter than this (m) are no elements of their own."""
 
 

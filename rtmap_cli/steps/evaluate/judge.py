@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rtmap_cli.errors import BadInput
 from rtmap_cli.formats.changes_json import ChangeFile, read_changes
 from rtmap_cli.geometry.poses import se3_from_quaternion, se3_from_xyyaw
-from rtmap_cli.logs.run import Run, read_run
+from rtmap_cli.logs.run import Run
 from rtmap_cli.maps.crs import check_same_crs, lonlat_to, utm_crs
 from rtmap_cli.steps.evaluate.changes import (
     FRAME_RANGE,
@@ -23,7 +23,7 @@ from rtmap_cli.steps.evaluate.changes import (
     score_changes,
 )
 from rtmap_cli.steps.evaluate.drives import Drive, drive_of, read_drives
-from rtmap_cli.steps.evaluate.poses import consistency, pose_errors, summarize
+from rtmap_cli.steps.evaluate.poses import PoseScore, chi_squares, pose_errors, summarize
 from rtmap_cli.tables import read_json
 
 Array = NDArray[np.float64]
@@ -35,20 +35,15 @@ KINDS = ("insert", "delete", "modify")
 """Changes that can be seen from geometry; others (paint) are not judged."""
 
 
-def judge_run(
-    run_path: Path, truth: str | Path, traversal: str | None = None, initial: bool = False
-) -> dict[str, Any]:
-    """Errors of a run's poses: ``summarize`` over the frames with an answer, and more.
-
-    ``frames`` and ``share_answered`` say how many frames had one (any status but no-match),
-    ``all_frames`` puts the initial pose where there is none, ``consistency`` judges the stated
-    covariances. ``initial`` judges T⁰ and its sigmas instead.
-    """
-    run = read_run(run_path)
+def judge_poses(
+    run: Run, truth: str | Path, traversal: str | None = None, initial: bool = False
+) -> PoseScore:
+    """Errors of a run's poses against POSES; ``initial`` judges T⁰ and its sigmas instead."""
+    where = run.path or run.log_id
     if run.poses is None and not initial:
-        raise BadInput(run_path, "has no poses yet", "run rtmap localize first, or pass --initial")
+        raise BadInput(where, "has no poses yet", "run rtmap localize first, or pass --initial")
     drive = drive_of(read_drives(truth, traversal), run.log_id, truth)
-    check_same_crs(run.crs, drive.crs, run_path)
+    check_same_crs(run.crs, drive.crs, where)
     true, known = drive.at(run.frames.timestamp_ns)
     if not known.all():
         first = int(run.frames.timestamp_ns[~known][0])
@@ -58,17 +53,7 @@ def judge_run(
             f"is it the truth of {run.log_id}?",
         )
     estimate, covariance, status = _estimates(run, initial)
-    answered = status != "no-match"
-    result = summarize(pose_errors(true[answered], estimate[answered]))
-    honest = consistency(true[answered], estimate[answered], covariance[answered])
-    return result | {
-        "method": "initial" if initial or run.poses is None else run.poses.method,
-        "frames": len(true),
-        "share_answered": float(answered.mean()),
-        "status": {str(s): int((status == s).sum()) for s in dict.fromkeys(status)},
-        "all_frames": summarize(pose_errors(true, estimate)),
-        "consistency": honest.as_json() if honest else None,
-    }
+    return PoseScore(pose_errors(true, estimate), status, chi_squares(true, estimate, covariance))
 
 
 def _estimates(run: Run, initial: bool) -> tuple[Array, Array, NDArray[Any]]:
@@ -77,8 +62,8 @@ def _estimates(run: Run, initial: bool) -> tuple[Array, Array, NDArray[Any]]:
     covariance = np.zeros((n, 3, 3))
     covariance[:, range(3), range(3)] = run.frames.sigma**2
     if initial or run.poses is None:
-        return run.frames.initial, covariance, np.full(n, "ok", object)
-    status = np.full(n, "no-match", object)
+        return run.frames.initial, covariance, np.full(n, "ok")
+    status = np.full(n, "no-match", dtype="<U16")
     row = {int(f): i for i, f in enumerate(run.frames.frame)}
     for k, frame in enumerate(run.poses.frame.tolist()):
         if frame in row:
