@@ -1,0 +1,71 @@
+"""Closed outlines (crossings): alignment vertex by vertex, means, overlap."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.polylines import resample
+
+Array = NDArray[np.float64]
+
+RING_POINTS = 80
+"""Points at equal arc length that a ring is compared with."""
+
+
+def signed_area(ring: Array) -> float:
+    """Area of a ring (closed or not), positive when counter-clockwise."""
+    x, y = ring[:, 0] - ring[0, 0], ring[:, 1] - ring[0, 1]
+    return float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2)
+
+
+def open_ring(ring: Array, count: int = RING_POINTS) -> Array:
+    """(count, 2) points at equal arc length, counter-clockwise, the first one not repeated."""
+    p = np.asarray(ring, np.float64)[:, :2]
+    if np.abs(p[0] - p[-1]).max() > 1e-9:
+        p = np.concatenate([p, p[:1]])
+    out = resample(p, count + 1)[:-1]
+    return out if signed_area(out) >= 0 else out[::-1]
+
+
+def align(ring: Array, reference: Array) -> Array:
+    """``ring`` (n, 2) with its start moved to where it fits ``reference`` (n, 2) best.
+
+    The cyclic shift of least squared distance, by circular correlation (FFT); both rings run
+    counter-clockwise.
+    """
+    a = (ring - ring.mean(axis=0)) @ np.array([1, 1j])
+    b = (reference - reference.mean(axis=0)) @ np.array([1, 1j])
+    match = np.fft.ifft(np.fft.fft(a) * np.conj(np.fft.fft(b))).real
+    return np.roll(ring, -int(match.argmax()), axis=0)
+
+
+def close(ring: Array) -> Array:
+    """The ring with its first vertex repeated at the end."""
+    return np.concatenate([ring, ring[:1]])
+
+
+def simplified(ring: Array, tolerance: float) -> Array:
+    """A closed ring without the vertices that lie within ``tolerance`` (m) of the outline."""
+    import shapely
+
+    thin = shapely.simplify(shapely.polygons(close(ring)), tolerance)
+    if thin.is_empty or thin.geom_type != "Polygon" or len(thin.exterior.coords) < 4:
+        return close(ring)
+    return np.asarray(thin.exterior.coords)
+
+
+def overlap(a: object, b: object) -> float:
+    """Intersection over union of two shapely polygons."""
+    import shapely
+
+    union = shapely.area(shapely.union(a, b))
+    return float(shapely.area(shapely.intersection(a, b)) / union) if union > 0 else 0.0
+
+
+def polygon(ring: Array) -> object:
+    """A valid shapely polygon of a ring, which may cross itself slightly."""
+    import shapely
+
+    out = shapely.polygons(ring[:, :2] if len(ring) > 3 else close(ring[:, :2]))
+    return out if out.is_valid else shapely.buffer(out, 0)

@@ -1,0 +1,188 @@
+"""Traversal: one run as the map sees it, everything in the map frame, as arrays.
+
+A traversal is the unit of independent evidence: its frames share pose errors, light and much of
+the network's error, so that n frames are not n votes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.errors import BadInput
+from rtmap_cli.geometry.poses import xyyaw_of
+from rtmap_cli.logs.run import OUTDATED, Run
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+FOUND_SCORE = 0.05
+"""Detections below this score carry no information and are not read."""
+
+
+@dataclass(frozen=True)
+class Traversal:
+    """The frames (m) and detected elements (n, with V vertices) of one run in the map frame.
+
+    ``pose`` (m, 3) x, y, yaw of map_SE3_ego with ``pose_covariance`` (m, 3, 3); ``range_m`` the
+    ego-frame box x_min, y_min, x_max, y_max; ``occluders`` per frame (k, 5): x, y, yaw, length,
+    width in the ego frame. Of each element: ``frame`` (n,) row of its frame, ``class_name``,
+    ``score``, ``points`` (n, V, 2) in the map frame and ``covariance`` (n, V, 2, 2) = R Σ Rᵀ of
+    the network's own scales (the pose's part is kept apart: it is common to a frame).
+    ``asked``: prior elements that the network was asked about, see ``Questions``.
+    """
+
+    run_id: str
+    timestamp_ns: Int
+    pose: Array
+    pose_covariance: Array
+    range_m: tuple[float, float, float, float]
+    occluders: list[Array]
+    frame: Int
+    class_name: NDArray[Any]
+    score: Array
+    points: Array
+    covariance: Array
+    cut: NDArray[np.bool_]
+    asked: Questions
+    model_sha256: str | None = None
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def kilometres(self) -> float:
+        """Distance driven between its frames."""
+        return float(np.hypot(*np.diff(self.pose[:, :2], axis=0).T).sum()) / 1000
+
+
+@dataclass(frozen=True)
+class Questions:
+    """What the network said about prior elements that it was given (R10, R11 of the paper).
+
+    ``frame`` (q,) row, ``element_id`` (q,), ``existence`` (q,) in [0, 1] and ``points``
+    (q, V, 2): the prior's own vertices in the map frame, i.e. the stretch that was asked about.
+    """
+
+    frame: Int
+    element_id: NDArray[Any]
+    existence: Array
+    points: Array
+
+
+def _occluders(run: Run, rows: dict[int, int], count: int) -> list[Array]:
+    out: list[Array] = [np.zeros((0, 5))] * count
+    if run.occluders is None or not len(run.occluders):
+        return out
+    names = ("x", "y", "yaw", "length", "width")
+    boxes = np.stack([run.occluders[n].to_numpy().astype(np.float64) for n in names], axis=1)
+    frames = run.occluders["frame"].to_numpy()
+    order = np.argsort(frames, kind="stable")
+    values, starts = np.unique(frames[order], return_index=True)
+    for value, part in zip(values, np.split(order, starts[1:]), strict=True):
+        if int(value) in rows:
+            out[rows[int(value)]] = boxes[part]
+    return out
+
+
+def _poses(run: Run) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Which frames have a usable pose, x, y, yaw (m, 3) and its covariance (m, 3, 3)."""
+    frames = run.frames
+    pose = xyyaw_of(frames.initial)
+    covariance = np.zeros((len(frames), 3, 3))
+    covariance[:, range(3), range(3)] = np.nan_to_num(frames.sigma, nan=1.0) ** 2
+    usable = np.ones(len(frames), bool)
+    if run.poses is None:
+        return usable, pose, covariance
+    row = {int(f): i for i, f in enumerate(run.poses.frame)}
+    axes = np.array([0, 1, 5])
+    for i, f in enumerate(frames.frame):
+        j = row.get(int(f))
+        if j is None or run.poses.status[j] == "no-match":
+            # A frame lost among localized ones would smear what they agree on.
+            usable[i] = False
+            continue
+        pose[i] = xyyaw_of(run.poses.pose[j])
+        covariance[i] = np.nan_to_num(run.poses.covariance[j][np.ix_(axes, axes)])
+    return usable, pose, covariance
+
+
+def _cut(points: Array, box: tuple[float, float, float, float], margin: float) -> Any:
+    """(n,) True where an element reaches the border of the range: it may go on beyond."""
+    low, high = np.array(box[:2]) + margin, np.array(box[2:]) - margin
+    return ((points < low) | (points > high)).any(axis=(1, 2))
+
+
+def range_box(run: Run) -> tuple[float, float, float, float]:
+    """The range of a run as x_min, y_min, x_max, y_max; BadInput when run.json has none."""
+    try:
+        x, y = run.info["range_m"]["x"], run.info["range_m"]["y"]
+        box = (float(x[0]), float(y[0]), float(x[1]), float(y[1]))
+    except (KeyError, TypeError, ValueError, IndexError):
+        where = (run.path / "run.json") if run.path else "run.json"
+        raise BadInput(where, "range_m must hold x and y, each [min, max] in metres") from None
+    return box
+
+
+def traversal_of(run: Run, min_score: float = FOUND_SCORE) -> Traversal:
+    """A run in the map frame: localized poses where there are any, else the initial ones.
+
+    Frames that localization could not place are left out when others were placed. Elements in
+    state ``outdated`` are answers about the prior, not detections: they appear in ``asked`` only.
+    """
+    o = run.observations
+    usable, pose, pose_covariance = _poses(run)
+    row = np.full(int(run.frames.frame.max(initial=0)) + 2, -1)
+    row[run.frames.frame[usable]] = np.arange(int(usable.sum()))
+    known = np.isin(o.frame, run.frames.frame)
+    if not known.all():
+        where = (run.path / "observations.parquet") if run.path else "observations"
+        raise BadInput(where, f"frame {int(o.frame[~known][0])} is not in frames.parquet")
+    frame = row[o.frame] if len(o) else np.zeros(0, np.int64)
+    pose, pose_covariance = pose[usable], pose_covariance[usable]
+    box = range_box(run)
+    detected = (frame >= 0) & (o.state != OUTDATED) & (o.score >= min_score)
+    asked = (frame >= 0) & np.isfinite(o.existence) & np.isfinite(o.prior_points).all((1, 2))
+    f = frame[detected]
+    c, s = np.cos(pose[f, 2]), np.sin(pose[f, 2])
+    rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=-2)
+    local = o.points[detected].astype(np.float64)
+    variance = o.sigma[detected].astype(np.float64) ** 2
+    points = np.einsum("nij,nvj->nvi", rotation, local) + pose[f, None, :2]
+    covariance = np.einsum("nij,nvj,nkj->nvik", rotation, variance, rotation)
+    rows = {int(k): int(v) for k, v in enumerate(row) if v >= 0}
+    return Traversal(
+        run_id=run.log_id,
+        timestamp_ns=run.frames.timestamp_ns[usable],
+        pose=pose,
+        pose_covariance=pose_covariance,
+        range_m=box,
+        occluders=_occluders(run, rows, len(pose)),
+        frame=f,
+        class_name=o.class_name[detected],
+        score=o.score[detected].astype(np.float64),
+        points=points,
+        covariance=covariance,
+        cut=_cut(local, box, 0.6) if len(local) else np.zeros(0, bool),
+        asked=Questions(
+            frame[asked],
+            o.element_id[asked],
+            o.existence[asked].astype(np.float64),
+            o.prior_points[asked],
+        ),
+        model_sha256=run.info.get("model_sha256"),
+    )
+
+
+def pose_variance(traversal: Traversal, frame: Int, xy: Array, normal: Array) -> Array:
+    """(n,) variance (m²) that the frames' poses add at map points ``xy`` along unit ``normal``.
+
+    First-order: δp = δt + δyaw · J (p − t) with J the quarter turn.
+    """
+    lever = xy - traversal.pose[frame, :2]
+    across = normal[:, 0] * -lever[:, 1] + normal[:, 1] * lever[:, 0]
+    jacobian = np.column_stack([normal, across])
+    return np.einsum("ni,nij,nj->n", jacobian, traversal.pose_covariance[frame], jacobian)

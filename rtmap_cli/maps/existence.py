@@ -1,0 +1,165 @@
+"""Existence as log-odds: how often something was found where it was in view, drive by drive.
+
+A drive gives one vote. Of ``views`` frames that could see a place, ``hits`` (fractional: a
+detection counts with the probability that it is real) found something. Frames of a drive are
+correlated, therefore the hit *rate* of a drive is a random quantity of its own (a beta-binomial
+model) and the votes of a drive saturate: a hundred frames say little more than ten.
+
+Two models are compared:
+
+* *exists*: most places are found at the usual rate of the class; a share of them is hard to see
+  (worn paint), in every drive alike;
+* *absent*: now and then a false detection; a share of the drives carries a ghost that stays in
+  place for that drive only.
+
+So one silent drive says less than two, and a ghost loses against the drives that do not see it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+LIMIT = 12.0
+"""Log-odds are kept within ± this: no map is so sure that it cannot learn."""
+PRIOR_LOG_ODDS = 3.0
+"""Log-odds of an element of a prior map that states none (19 of 20 are there)."""
+
+
+@dataclass(frozen=True)
+class VoteModel:
+    """Parameters of the two models; all shares and rates are probabilities.
+
+    ``found``: usual hit rate per view; ``hard``: share of places that are hard to see, found at
+    ``hard_rate`` × found; ``false_rate``: hits per view where nothing is; ``ghost``: share of the
+    drives in which a false detection stays in place, seen at ``ghost_rate`` × found;
+    ``strength``: how alike the frames of a drive are (beta-binomial pseudo-count, lower = more
+    alike); ``most_views``: frames beyond which a drive's vote does not grow.
+    """
+
+    found: float = 0.6
+    hard: float = 0.12
+    hard_rate: float = 0.35
+    false_rate: float = 0.04
+    ghost: float = 0.05
+    ghost_rate: float = 0.4
+    strength: float = 4.0
+    most_views: float = 8.0
+
+    def with_found(self, found: float) -> VoteModel:
+        """The same model with another usual hit rate."""
+        from dataclasses import replace
+
+        return replace(self, found=float(np.clip(found, 0.25, 0.95)))
+
+
+def _log_beta_binomial(hits: Array, misses: Array, rate: float, strength: float) -> Array:
+    """log of B(a + hits, b + misses) / B(a, b); fractional counts are allowed."""
+    from scipy.special import betaln
+
+    a, b = rate * strength, (1 - rate) * strength
+    out: Array = betaln(a + hits, b + misses) - betaln(a, b)
+    return out
+
+
+def drive_log_likelihoods(hits: Array, views: Array, model: VoteModel) -> Array:
+    """(3, ...) log-likelihoods of one drive's counts: exists and easy, exists and hard, absent.
+
+    Without a view all three are 0: never looked is no evidence.
+    """
+    views = np.maximum(views, 0.0)
+    rate = np.clip(np.where(views > 0, hits / np.maximum(views, 1e-9), 0.0), 0.0, 1.0)
+    n = np.minimum(views, model.most_views)
+    h = rate * n
+    m = n - h
+    s = model.strength
+    easy = _log_beta_binomial(h, m, model.found, s)
+    hard = _log_beta_binomial(h, m, model.hard_rate * model.found, s)
+    false = _log_beta_binomial(h, m, model.false_rate, s)
+    ghost = _log_beta_binomial(h, m, model.ghost_rate * model.found, s)
+    absent = np.logaddexp(np.log1p(-model.ghost) + false, np.log(model.ghost) + ghost)
+    return np.stack([easy, hard, absent])
+
+
+def log_odds_of(votes: Array, model: VoteModel) -> Array:
+    """Log-likelihood ratio exists : absent of summed (3, ...) log-likelihoods of many drives.
+
+    Whether a place is hard to see is the same in all drives, therefore the mixture is taken over
+    the product of the drives and not drive by drive.
+    """
+    easy, hard, absent = votes
+    exists = np.logaddexp(np.log1p(-model.hard) + easy, np.log(model.hard) + hard)
+    out: Array = exists - absent
+    return out
+
+
+def probability(log_odds: Array | float) -> Array:
+    """The probability of log-odds."""
+    return 1.0 / (1.0 + np.exp(-np.clip(np.asarray(log_odds, np.float64), -50, 50)))
+
+
+def logit(probability_: Array | float, limit: float = LIMIT) -> Array:
+    """The log-odds of a probability, within ± ``limit``."""
+    p = np.clip(np.asarray(probability_, np.float64), 1e-9, 1 - 1e-9)
+    return np.clip(np.log(p) - np.log1p(-p), -limit, limit)
+
+
+def usual_rate(hits: Array, views: Array, default: float, enough: float = 4.0) -> float:
+    """The usual hit rate of a class, measured on places with at least ``enough`` views.
+
+    The upper-middle of the rates is taken, so that places where nothing is do not count; a few
+    places are mixed with ``default``.
+    """
+    ok = views >= enough
+    rate = hits[ok] / views[ok]
+    rate = rate[rate > 0.15]
+    if not len(rate):
+        return default
+    count = len(rate)
+    return float((np.quantile(rate, 0.6) * count + default * 20) / (count + 20))
+
+
+def stretches(evidence: Array, weight: Array, prior: float, switch: float, ring: bool) -> Array:
+    """Which stations of a line exist: the best two-state sequence along it (Viterbi).
+
+    ``evidence`` (n,) log-likelihood ratio of each station, ``weight`` (n,) the share of a vote
+    that the station carries (spacing / correlation length), ``prior`` log-odds of the line,
+    ``switch`` the cost of a change of state. Returns (n,) True where it exists. On a ring the
+    sequence runs around twice, so that its start has no special place.
+    """
+    n = len(evidence)
+    gain = (evidence + prior) * weight
+    if ring:
+        gain = np.concatenate([gain, gain])
+    score = np.array([0.0, 0.0])
+    back = np.zeros((len(gain), 2), np.int8)
+    for k, g in enumerate(gain):
+        stay, change = score, score[::-1] - switch
+        back[k] = np.where(stay >= change, [0, 1], [1, 0])
+        score = np.maximum(stay, change) + np.array([-g / 2, g / 2])
+    state = int(score[1] >= score[0])
+    out = np.zeros(len(gain), bool)
+    for k in range(len(gain) - 1, -1, -1):
+        out[k] = bool(state)
+        state = int(back[k, state])
+    if ring:
+        half = n // 2
+        middle = out[half : half + n]
+        out = np.roll(middle, half)
+    return out[:n]
+
+
+def runs_of(flags: NDArray[np.bool_], ring: bool = False) -> list[Int]:
+    """Index runs in which ``flags`` is True; on a ring the last run continues with the first."""
+    index = np.flatnonzero(flags)
+    if not len(index):
+        return []
+    parts = np.split(index, np.flatnonzero(np.diff(index) > 1) + 1)
+    if ring and len(parts) > 1 and flags[0] and flags[-1]:
+        parts[0] = np.concatenate([parts.pop(), parts[0]])
+    return [np.asarray(p, np.int64) for p in parts]

@@ -1,0 +1,335 @@
+"""The next map version from the evidence: confirm and move, insert, delete, split."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.polylines import arc_length, is_ring, length
+from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
+from rtmap_cli.maps.evidence import Counts, Evidence, Policy, Stretch
+from rtmap_cli.maps.existence import LIMIT, PRIOR_LOG_ODDS, probability
+from rtmap_cli.maps.refit import FusionModel
+from rtmap_cli.steps.crowdsource.lines import fuse_lines, snap_ends
+from rtmap_cli.steps.crowdsource.rings import fuse_ring
+
+Array = NDArray[np.float64]
+
+SNAP, SNAP_ANGLE = 3.0, float(np.radians(30))
+"""Ends of new lines are joined to ends that they look at over such a gap (m)."""
+UNCHARTED = 15.0
+"""Where no element of the prior is so near (m), one drive is enough to start a map."""
+THIN = 0.04
+"""Vertices of new lines that lie so near (m) to the line of their neighbours are left out."""
+
+
+@dataclass
+class Fusion:
+    """The next version and what is different: ids ``inserted``, ``deleted`` (an element, or parts
+    of it), ``moved`` (geometry changed), ``untouched`` (not in view) and ``waiting`` (new, but not
+    yet seen by enough drives)."""
+
+    vector_map: VectorMap
+    inserted: list[str] = field(default_factory=list)
+    deleted: list[str] = field(default_factory=list)
+    split: list[str] = field(default_factory=list)
+    moved: list[str] = field(default_factory=list)
+    untouched: list[str] = field(default_factory=list)
+    waiting: list[str] = field(default_factory=list)
+
+    def counts(self) -> dict[str, int]:
+        """Numbers of each kind."""
+        names = ("inserted", "deleted", "split", "moved", "untouched", "waiting")
+        return {name: len(getattr(self, name)) for name in names}
+
+
+def fuse(
+    prior: VectorMap,
+    evidence: Sequence[Evidence],
+    fresh: Sequence[Traversal],
+    every: Sequence[Traversal],
+    policy: Policy | None = None,
+    model: FusionModel | None = None,
+) -> Fusion:
+    """Fuse the ``fresh`` traversals into ``prior``; ``every`` includes those fused before.
+
+    The order of the traversals does not matter. Elements without any evidence are returned as
+    they are, so that their tiles stay untouched.
+    """
+    policy, model = policy or Policy(), model or FusionModel()
+    fresh = sorted(fresh, key=lambda t: t.run_id)
+    every = sorted(every, key=lambda t: t.run_id)
+    out = Fusion(VectorMap((), prior.crs))
+    charted = _Charted(prior)
+    pieces = [p for e in evidence for p in _pieces(e, policy, charted, out)]
+    judged = {e.element.element_id for e in evidence if not e.new}
+    rest = [e for e in prior if e.element_id not in judged]
+    elements = rest + _geometry(pieces, fresh, every, model, out)
+    out.untouched += [e.element_id for e in rest]
+    out.vector_map = VectorMap(_unique_ids(elements), prior.crs)
+    return out
+
+
+@dataclass
+class _Piece:
+    """An element of the next version before its geometry is fused."""
+
+    element: Element
+    new: bool
+    seen: bool
+
+
+class _Charted:
+    """Whether the prior knows anything near a place."""
+
+    def __init__(self, prior: VectorMap) -> None:
+        import shapely
+
+        self.tree = shapely.STRtree([shapely.LineString(e.xy) for e in prior])
+
+    def near(self, points: Array) -> bool:
+        """True when a prior element lies within ``UNCHARTED`` metres."""
+        import shapely
+
+        line = shapely.LineString(points[:, :2])
+        return len(self.tree.query(line, predicate="dwithin", distance=UNCHARTED)) > 0
+
+
+def _pieces(evidence: Evidence, policy: Policy, charted: _Charted, out: Fusion) -> list[_Piece]:
+    """What remains of an element, or what a candidate becomes."""
+    if evidence.new:
+        return _inserted(evidence, policy, charted, out)
+    element = evidence.element
+    if not evidence.in_view:
+        out.untouched.append(element.element_id)
+        return [_Piece(element, False, False)]
+    kept, gone = [], []
+    for stretch in evidence.stretches:
+        absent = not stretch.exists and _deletable(element, stretch, policy)
+        (gone if absent else kept).append(stretch)
+    if gone:
+        out.deleted.append(element.element_id)
+    if not kept:
+        return []
+    kept = _merged(kept, bool(gone))
+    whole = len(kept) == 1 and not gone
+    if whole:
+        return [_Piece(_updated(element, evidence.likelihood_ratio, evidence.counts), False, True)]
+    out.split.append(element.element_id)
+    return _split(element, kept)
+
+
+def _deletable(element: Element, stretch: Stretch, policy: Policy) -> bool:
+    """Improbable, and enough drives had a look at it (those of earlier fusions included)."""
+    looked = element.traversals + stretch.counts.traversals_in_view
+    unlikely = float(probability(stretch.log_odds)) < policy.delete_below
+    return unlikely and looked >= policy.delete_traversals
+
+
+def _merged(kept: list[Stretch], cut: bool) -> list[Stretch]:
+    """Kept stretches; doubtful ones stay apart so that their doubt is not averaged away."""
+    del cut
+    return sorted(kept, key=lambda s: s.start)
+
+
+def _split(element: Element, kept: list[Stretch]) -> list[_Piece]:
+    """Elements for the stretches of one; the longest keeps the id."""
+    order = sorted(range(len(kept)), key=lambda k: (-length(kept[k].geometry), k))
+    taken = element.element_id
+    out: dict[int, _Piece] = {}
+    for rank, k in enumerate(order):
+        stretch = kept[k]
+        name = taken if rank == 0 else f"{taken}.{rank}"
+        geometry, covariance = _part(element, stretch)
+        piece = replace(element, element_id=name, points=geometry, covariance=covariance)
+        out[k] = _Piece(_updated(piece, stretch.likelihood_ratio, stretch.counts), False, True)
+    return [out[k] for k in sorted(out)]
+
+
+def _part(element: Element, stretch: Stretch) -> tuple[Array, Array | None]:
+    """Geometry of a stretch with covariances interpolated along the element."""
+    geometry = np.asarray(stretch.geometry, np.float64)
+    if geometry.shape[1] == 2:
+        geometry = np.column_stack([geometry, np.full(len(geometry), np.nan)])
+    if element.covariance is None:
+        return geometry, None
+    from rtmap_cli.geometry.polylines import project
+
+    _, _, segment = project(geometry, element.points)
+    at = arc_length(element.points)
+    a = element.points[segment, :2]
+    s = at[segment] + np.hypot(*(geometry[:, :2] - a).T)
+    rows = [np.interp(s, at, element.covariance[:, k]) for k in range(4)]
+    return geometry, np.stack(rows, axis=-1)
+
+
+def _updated(element: Element, ratio: float, counts: Counts) -> Element:
+    """The element with the votes and counts of these runs added."""
+    before = element.existence
+    if element.traversals == 0 and element.existence == 0.0:
+        before = PRIOR_LOG_ODDS
+    if not counts.traversals_in_view:
+        return element
+    firsts = [t for t in (element.first_seen_ns, counts.first_seen_ns) if t is not None]
+    lasts = [t for t in (element.last_seen_ns, counts.last_seen_ns) if t is not None]
+    return replace(
+        element,
+        existence=float(np.clip(before + ratio, -LIMIT, LIMIT)),
+        seen=element.seen + counts.frames_seen,
+        in_view=element.in_view + counts.frames_in_view,
+        traversals=element.traversals + counts.traversals_in_view,
+        first_seen_ns=min(firsts) if firsts else None,
+        last_seen_ns=max(lasts) if lasts else None,
+        runs=tuple(sorted({*element.runs, *counts.runs})),
+    )
+
+
+def _inserted(evidence: Evidence, policy: Policy, charted: _Charted, out: Fusion) -> list[_Piece]:
+    stretch, counts = evidence.stretches[0], evidence.counts
+    element = evidence.element
+    if float(probability(stretch.log_odds)) < policy.insert_above:
+        return []
+    first = not charted.near(element.points)
+    need = policy.insert_traversals
+    if first:
+        need = min(need, max(counts.traversals_in_view, 1))
+    if counts.traversals_seen < need:
+        out.waiting.append(element.element_id)
+        return []
+    out.inserted.append(element.element_id)
+    fresh = replace(
+        element,
+        existence=stretch.log_odds,
+        seen=counts.frames_seen,
+        in_view=counts.frames_in_view,
+        traversals=counts.traversals_in_view,
+        first_seen_ns=counts.first_seen_ns,
+        last_seen_ns=counts.last_seen_ns,
+        runs=counts.runs,
+    )
+    return [_Piece(fresh, True, True)]
+
+
+# ---- geometry
+
+
+def _geometry(
+    pieces: list[_Piece],
+    fresh: Sequence[Traversal],
+    every: Sequence[Traversal],
+    model: FusionModel,
+    out: Fusion,
+) -> list[Element]:
+    done: dict[int, Element] = {}
+    for name in dict.fromkeys(p.element.class_name for p in pieces):
+        index = [k for k, p in enumerate(pieces) if p.element.class_name == name]
+        if name in RING_CLASSES:
+            for k in index:
+                done[k] = _fused_ring(pieces[k], name, fresh, every, model, out)
+            continue
+        group = [pieces[k] for k in index]
+        for k, element in zip(
+            index, _fused_lines(group, name, fresh, every, model, out), strict=True
+        ):
+            done[k] = element
+    return [done[k] for k in sorted(done)]
+
+
+def _fused_lines(
+    pieces: list[_Piece],
+    name: str,
+    fresh: Sequence[Traversal],
+    every: Sequence[Traversal],
+    model: FusionModel,
+    out: Fusion,
+) -> list[Element]:
+    new = [p.new for p in pieces]
+    points = [p.element.points.copy() for p in pieces]
+    covariances = [p.element.covariance for p in pieces]
+    fused = fuse_lines(points, covariances, new, name, fresh, every, model)
+    moved = [f.points.copy() for f in fused]
+    snap_ends(moved, new, SNAP, SNAP_ANGLE)
+    elements = []
+    model_sha = _model_of(every)
+    for piece, f, xyz in zip(pieces, fused, moved, strict=True):
+        if not f.touched or not piece.seen:
+            elements.append(piece.element)
+            continue
+        covariance = f.covariance
+        if piece.new:
+            xyz, covariance = _thinned(xyz, covariance)
+        else:
+            out.moved.append(piece.element.element_id)
+        elements.append(
+            replace(
+                piece.element,
+                points=xyz,
+                covariance=covariance,
+                model_sha256=model_sha or piece.element.model_sha256,
+            )
+        )
+    return elements
+
+
+def _thinned(points: Array, covariance: Array | None) -> tuple[Array, Array | None]:
+    """A new line without needless vertices (Douglas–Peucker), covariances of those that stay."""
+    import shapely
+
+    ring = is_ring(points)
+    thin = np.asarray(shapely.simplify(shapely.LineString(points[:, :2]), THIN).coords)
+    from scipy.spatial import cKDTree
+
+    _, keep = cKDTree(points[:, :2]).query(thin)
+    keep = np.asarray(keep)
+    if ring:
+        keep[-1] = keep[0]
+    return points[keep], None if covariance is None else covariance[keep]
+
+
+def _fused_ring(
+    piece: _Piece,
+    name: str,
+    fresh: Sequence[Traversal],
+    every: Sequence[Traversal],
+    model: FusionModel,
+    out: Fusion,
+) -> Element:
+    if not piece.seen:
+        return piece.element
+    e = piece.element
+    drives = every if piece.new else fresh
+    fused = fuse_ring(e.points, e.covariance, piece.new, name, drives, model)
+    if not fused.touched:
+        return e
+    if not piece.new:
+        out.moved.append(e.element_id)
+    return replace(
+        e,
+        points=fused.points,
+        covariance=fused.covariance,
+        model_sha256=_model_of(drives) or e.model_sha256,
+    )
+
+
+def _model_of(traversals: Sequence[Traversal]) -> str | None:
+    """The model behind the traversals: one hash, or the newest run's where they differ."""
+    known = [(int(t.timestamp_ns[-1]), t.model_sha256) for t in traversals if len(t.timestamp_ns)]
+    named = [k for k in known if k[1]]
+    return max(named)[1] if named else None
+
+
+def _unique_ids(elements: list[Element]) -> list[Element]:
+    """Ids that clash (two finds at one place) get a number."""
+    seen: set[str] = set()
+    out = []
+    for e in elements:
+        name, k = e.element_id, 1
+        while name in seen:
+            name, k = f"{e.element_id}.{k}", k + 1
+        seen.add(name)
+        out.append(e if name == e.element_id else replace(e, element_id=name))
+    return out

@@ -1,0 +1,182 @@
+"""Lines of the next map version: prior pieces and accepted new lines, moved by their evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.polylines import is_ring
+from rtmap_cli.logs.traversal import Traversal, pose_variance
+from rtmap_cli.maps.refit import (
+    FusionModel,
+    combine,
+    drive_offsets,
+    measured_share,
+    solve_vertices,
+)
+from rtmap_cli.maps.stations import Stations, assign, samples_of, smoother, stations_of
+
+Array = NDArray[np.float64]
+
+UNKNOWN_SIGMA = 0.25
+"""Standard deviation (m, each axis) of a prior vertex that states none."""
+NEW_SIGMA = 1.0
+"""Standard deviation (m) of a new line's vertices before its detections are fused."""
+END_SIGMA = 0.8
+"""Along-line standard deviation (m) of an open end: detections are cut short there."""
+LONGEST_MOVE = 1.0
+"""A vertex moves no farther (m) in one fusion: more is a wrong assignment."""
+
+
+@dataclass(frozen=True)
+class Fused:
+    """New vertices ``points`` (n, 3) with ``covariance`` (n, 4), or nothing when untouched."""
+
+    points: Array
+    covariance: Array | None
+    touched: bool
+
+
+def planar(covariance: Array | None, n: int, unknown: float = UNKNOWN_SIGMA) -> Array:
+    """(n, 2, 2) of a covariance (n, 4: xx, xy, yy, zz); unknown ones become ``unknown``² · I."""
+    out = np.tile(np.eye(2) * unknown**2, (n, 1, 1))
+    if covariance is None:
+        return out
+    known = np.isfinite(covariance[:, :3]).all(axis=1)
+    full = covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    # A singular covariance would make its vertex immovable and its inverse infinite.
+    out[known] = full[known] + np.eye(2) * 1e-6
+    return out
+
+
+def columns(planar_covariance: Array, heights: Array | None) -> Array:
+    """(n, 4) xx, xy, yy, zz from (n, 2, 2) and the zz column of what was before."""
+    zz = np.full(len(planar_covariance), np.nan) if heights is None else heights[:, 3]
+    flat = planar_covariance.reshape(-1, 4)[:, [0, 1, 3]]
+    return np.column_stack([flat, zz])
+
+
+def fuse_lines(
+    points: Sequence[Array],
+    covariances: Sequence[Array | None],
+    new: Sequence[bool],
+    class_name: str,
+    fresh: Sequence[Traversal],
+    every: Sequence[Traversal],
+    model: FusionModel,
+) -> list[Fused]:
+    """Eq. 5 for the lines of one class, all at once.
+
+    Prior lines are moved by the ``fresh`` traversals (what the map was already fused from does not
+    count again), ``new`` ones by ``every`` traversal. Vertices shared by two pieces of a chain
+    get the same displacement, so that the pieces stay joined.
+    """
+    if not points:
+        return []
+    stations = stations_of([p[:, :2] for p in points])
+    is_new = np.asarray(new, bool)
+    old = _offsets(stations, class_name, fresh, model)
+    late = old if len(fresh) == len(every) else _offsets(stations, class_name, every, model)
+    pick = is_new[stations.line]
+    offset, variance = np.where(pick, late, old)
+    start = np.cumsum([0, *(len(p) for p in points)])
+    vertices = np.concatenate([p[:, :2] for p in points])
+    before = np.concatenate(
+        [
+            planar(c, len(p), NEW_SIGMA if fresh_line else UNKNOWN_SIGMA)
+            for p, c, fresh_line in zip(points, covariances, new, strict=True)
+        ]
+    )
+    chain = np.concatenate(
+        [np.full(len(p), stations.chain[stations.of_line(k)[0]]) for k, p in enumerate(points)]
+    )
+    move, after = solve_vertices(vertices, chain, before, stations, offset, variance, 1.5)
+    size = np.hypot(move[:, 0], move[:, 1])
+    move *= np.minimum(1.0, LONGEST_MOVE / np.maximum(size, 1e-9))[:, None]
+    out = []
+    for k, p in enumerate(points):
+        part = slice(start[k], start[k + 1])
+        seen = np.isfinite(variance[stations.of_line(k)]).any()
+        if not seen:
+            out.append(Fused(p, covariances[k], False))
+            continue
+        xy = p[:, :2] + move[part]
+        cov = after[part] + np.eye(2) * model.floor**2 * 0.25
+        if is_new[k]:
+            cov = _known_along(cov, xy)
+        if is_ring(p):
+            xy[-1], cov[-1] = xy[0], cov[0]
+        heights = covariances[k]
+        out.append(Fused(np.column_stack([xy, p[:, 2]]), columns(cov, heights), True))
+    return out
+
+
+def _known_along(covariance: Array, xy: Array) -> Array:
+    """Along a line a vertex may lie anywhere; only the ends are uncertain there, by how
+    detections are cut. Interior vertices slide freely and keep what the system gave them."""
+    from rtmap_cli.geometry.polylines import tangents
+
+    out = covariance.copy()
+    t = tangents(xy)
+    for k in (0, -1):
+        out[k] += np.outer(t[k], t[k]) * END_SIGMA**2
+    return out
+
+
+def _offsets(
+    stations: Stations, class_name: str, traversals: Sequence[Traversal], model: FusionModel
+) -> tuple[Array, Array]:
+    """Offset and variance of every station over the traversals (NaN, inf where unseen)."""
+    n = len(stations)
+    if not traversals:
+        return np.full(n, np.nan), np.full(n, np.inf)
+    smooth = smoother(stations, model.width)
+    drives = []
+    for traversal in traversals:
+        k = np.flatnonzero(traversal.class_name == class_name)
+        samples = samples_of(
+            traversal.points[k], traversal.covariance[k], traversal.score[k], traversal.frame[k]
+        )
+        feet, _ = assign(stations, samples)
+        noise = pose_variance(
+            traversal,
+            samples.frame[feet.sample],
+            samples.xy[feet.sample],
+            stations.normal[feet.station],
+        )
+        drives.append(drive_offsets(stations, smooth, samples, feet, noise, model))
+    return combine(drives, measured_share(drives, model), model)
+
+
+def snap_ends(points: list[Array], new: Sequence[bool], reach: float, angle: float) -> None:
+    """Put the open ends of new lines onto ends that they look at, in place.
+
+    A stretch that was missing in the prior closes the gap exactly: the new end becomes the old
+    vertex. Ends at most ``reach`` m apart whose directions differ by less than ``angle`` (rad).
+    """
+    from rtmap_cli.geometry.polylines import tangents
+
+    ends: list[tuple[int, int, Array, Array]] = []
+    for k, p in enumerate(points):
+        if is_ring(p) or len(p) < 2:
+            continue
+        t = tangents(p)
+        ends += [(k, 0, p[0, :2].copy(), -t[0]), (k, -1, p[-1, :2].copy(), t[-1])]
+    used: set[tuple[int, int]] = set()
+    options = []
+    for a in ends:
+        if not new[a[0]]:
+            continue
+        for b in ends:
+            gap = float(np.hypot(*(a[2] - b[2])))
+            if a[0] == b[0] or gap > reach or -(a[3] @ b[3]) < np.cos(angle):
+                continue
+            options.append((gap, a[0], a[1], b[0], b[1]))
+    for _, ka, ea, kb, eb in sorted(options):
+        if (ka, ea) in used or (kb, eb) in used:
+            continue
+        used |= {(ka, ea), (kb, eb)}
+        points[ka][ea, :2] = points[kb][eb, :2]

@@ -1,0 +1,118 @@
+"""Closed elements of the next version: outlines averaged point by point over all drives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.rings import align, close, open_ring, simplified
+from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.refit import FusionModel
+from rtmap_cli.steps.crowdsource.lines import LONGEST_MOVE, Fused, columns, planar
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+SIMPLIFY = 0.25
+"""A vertex of a new outline that lies so near (m) to the line of its neighbours is left out."""
+NEAR = 3.5
+"""A detection whose centre is farther (m) from the element's is not averaged."""
+
+
+def _drive_mean(
+    rings: Array, variance: Array, score: Array, reference: Array, model: FusionModel
+) -> tuple[Array, float]:
+    """Mean outline of one drive's detections and the variance per axis of its points."""
+    weight = score / variance if model.use_sigma else score
+    aligned = np.stack([align(r, reference) for r in rings])
+    mean = (aligned * weight[:, None, None]).sum(0) / weight.sum()
+    effective = weight.sum() ** 2 / (weight**2).sum()
+    single = float((weight * variance).sum() / weight.sum())
+    share = model.drive_share
+    return mean, single * (share + (1 - share) / effective) + model.floor**2
+
+
+def _combined(
+    means: Array, variances: Array, base: Array | None, model: FusionModel
+) -> tuple[Array, Array]:
+    """Outline over the drives (k, n, 2) with per-point Huber weights, and its variance (n,)."""
+    centre = np.median(means, axis=0) if base is None else base
+    weight = 1.0 / variances[:, None] if model.use_sigma else np.ones((len(means), 1))
+    for _ in range(4):
+        z = np.hypot(*np.moveaxis(means - centre, -1, 0)) / np.sqrt(2 * variances[:, None])
+        w = weight * np.minimum(1.0, model.huber / np.maximum(z, 1e-9))
+        centre = (means * w[..., None]).sum(0) / w.sum(0)[:, None]
+    information = (w / weight / variances[:, None]).sum(axis=0)
+    common = model.place_share * variances.min() + model.floor**2
+    return centre, 1.0 / information + common
+
+
+def fuse_ring(
+    points: Array,
+    covariance: Array | None,
+    new: bool,
+    class_name: str,
+    traversals: Sequence[Traversal],
+    model: FusionModel,
+) -> Fused:
+    """One closed element from the detections around it and, unless ``new``, its prior.
+
+    The vertices of a prior outline keep their number and order: each moves by the offset that
+    the outline has at its place, by Eq. 5 with its own covariance.
+    """
+    reference = open_ring(points)
+    means, variances = [], []
+    for traversal in traversals:
+        index = _near(traversal, class_name, reference)
+        if not len(index):
+            continue
+        rings = np.stack([open_ring(p) for p in traversal.points[index]])
+        cov = traversal.covariance[index]
+        variance = np.maximum((cov[..., 0, 0] + cov[..., 1, 1]).mean(axis=1) / 2, 0.01)
+        pose = traversal.pose_covariance[traversal.frame[index]]
+        mean, spread = _drive_mean(rings, variance, traversal.score[index], reference, model)
+        means.append(mean)
+        variances.append(spread + float((pose[:, 0, 0] + pose[:, 1, 1]).mean() / 2))
+    if not means:
+        return Fused(points, covariance, False)
+    base = None if new else reference
+    outline, variance = _combined(np.stack(means), np.array(variances), base, model)
+    if new:
+        ring = simplified(outline, SIMPLIFY)
+        near = np.argmin(np.hypot(*np.moveaxis(ring[:, None] - outline, -1, 0)), axis=1)
+        spread = np.eye(2) * variance[near, None, None]
+        heights = np.full(len(ring), np.nan)
+        return Fused(np.column_stack([ring, heights]), columns(spread, None), True)
+    return _moved(points, covariance, reference, outline, variance)
+
+
+def _near(traversal: Traversal, class_name: str, reference: Array) -> Int:
+    """Whole detections of the class whose centre lies at the element's."""
+    mine = np.flatnonzero((traversal.class_name == class_name) & ~traversal.cut)
+    if not len(mine):
+        return mine
+    centres = np.stack([open_ring(p).mean(axis=0) for p in traversal.points[mine]])
+    return mine[np.hypot(*(centres - reference.mean(axis=0)).T) <= NEAR]
+
+
+def _moved(
+    points: Array, covariance: Array | None, reference: Array, outline: Array, variance: Array
+) -> Fused:
+    """Prior vertices moved by the information-weighted offset of the outline at their places."""
+    n = len(points) - 1
+    distance = np.hypot(*np.moveaxis(points[:n, None, :2] - reference, -1, 0))
+    weight = np.exp(-0.5 * (distance / 1.0) ** 2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    offset = weight @ (outline - reference)
+    spread = weight @ variance
+    before = planar(covariance, len(points))[:n]
+    after = np.linalg.inv(np.linalg.inv(before) + np.eye(2) / spread[:, None, None])
+    move = np.einsum("nij,nj->ni", after, offset / spread[:, None])
+    size = np.hypot(move[:, 0], move[:, 1])
+    move *= np.minimum(1.0, LONGEST_MOVE / np.maximum(size, 1e-9))[:, None]
+    xy = points[:n, :2] + move
+    fused = np.column_stack([close(xy), points[:, 2]])
+    cov = np.concatenate([after, after[:1]])
+    return Fused(fused, columns(cov, covariance), True)

@@ -1,0 +1,223 @@
+"""Closed elements: what the drives say about prior rings, and clusters of rings that are new."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.rings import align, open_ring, overlap, polygon
+from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.visibility import Views, views
+from rtmap_cli.steps.detect_changes.votes import DriveCounts, count, view_weight
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+NEAR = 3.5
+"""Rings whose features (centre, direction) differ by more than this (m) are different ones."""
+VISIBLE = 0.65
+"""A ring is in view of a frame when this share of its outline and middle is."""
+RING_MARGIN = 0.5
+"""Border of the range (m) in which the outline does not count as looked at."""
+
+
+@dataclass(frozen=True)
+class Rings:
+    """Detected rings of one drive: ``points`` (n, 80, 2) counter-clockwise, ``variance`` (n,) mean
+    per axis (m²), ``score``, ``frame``, ``cut`` by the range, ``feature`` (n, 4)."""
+
+    points: Array
+    variance: Array
+    score: Array
+    frame: Int
+    cut: NDArray[np.bool_]
+    feature: Array
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def features(rings: Array) -> Array:
+    """(n, 4) centre and direction of rings (n, k, 2): x, y and up to 3 m · (cos 2θ, sin 2θ).
+
+    The direction of the longer axis counts as far as the ring is longer than wide.
+    """
+    centre = rings.mean(axis=1)
+    d = rings - centre[:, None]
+    xx, yy = (d[..., 0] ** 2).mean(1), (d[..., 1] ** 2).mean(1)
+    xy = (d[..., 0] * d[..., 1]).mean(1)
+    long = np.hypot((xx - yy) / 2, xy)
+    share = 3.0 * long / np.maximum((xx + yy) / 2, 1e-9)
+    angle = np.arctan2(2 * xy, xx - yy)
+    return np.column_stack([centre, share * np.cos(angle), share * np.sin(angle)])
+
+
+def class_rings(traversal: Traversal, class_name: str) -> Rings:
+    """A drive's detections of a closed class in the map frame."""
+    index = np.flatnonzero(traversal.class_name == class_name)
+    points = np.array([open_ring(p) for p in traversal.points[index]]).reshape(len(index), -1, 2)
+    variance = traversal.covariance[index]
+    return Rings(
+        points,
+        (variance[..., 0, 0] + variance[..., 1, 1]).mean(axis=1) / 2,
+        traversal.score[index],
+        traversal.frame[index],
+        traversal.cut[index],
+        features(points) if len(index) else np.zeros((0, 4)),
+    )
+
+
+def match(rings: Rings, places: Array, near: float = NEAR) -> Int:
+    """(n,) index of the place (m, 80, 2) that each detection belongs to, or -1.
+
+    The nearest in the feature space; a detection cut by the range may also overlap the place
+    by 15 % of the union, because its centre is not the centre of the element.
+    """
+    from scipy.spatial import cKDTree
+
+    out = np.full(len(rings), -1)
+    if not len(places) or not len(rings):
+        return out
+    distance, nearest = cKDTree(features(places)).query(rings.feature)
+    out[distance <= near] = nearest[distance <= near]
+    left = np.flatnonzero(out < 0)
+    if not len(left):
+        return out
+    centres, radius = places.mean(axis=1), np.ptp(places, axis=1).max(axis=1)
+    shapes = [polygon(p) for p in places]
+    for k in left:
+        reach = np.hypot(*(centres - rings.feature[k, :2]).T)
+        close = np.flatnonzero(reach < radius)
+        if not len(close):
+            continue
+        shape = polygon(rings.points[k])
+        shares = [overlap(shape, shapes[j]) for j in close]
+        if max(shares) >= 0.15:
+            out[k] = close[int(np.argmax(shares))]
+    return out
+
+
+def new_rings(prior: Array, drives: Sequence[Rings], least: float = 0.8) -> Array:
+    """(m, 80, 2) mean rings of detections that no prior ring explains; not yet judged.
+
+    Greedy clusters by support (Σ score of the neighbours), then means with reassignment, twice.
+    Clusters with a summed score below ``least`` are noise.
+    """
+    loose = [match(r, prior) < 0 for r in drives]
+    keep = [m & ~r.cut for m, r in zip(loose, drives, strict=True)]
+    if not any(k.any() for k in keep):
+        # Crossings longer than the range is wide are always cut: better a piece than nothing.
+        keep = loose
+    points = np.concatenate([r.points[k] for r, k in zip(drives, keep, strict=True)])
+    if not len(points):
+        return np.zeros((0, *prior.shape[1:]))
+    feature = np.concatenate([r.feature[k] for r, k in zip(drives, keep, strict=True)])
+    score = np.concatenate([r.score[k] for r, k in zip(drives, keep, strict=True)])
+    variance = np.concatenate([r.variance[k] for r, k in zip(drives, keep, strict=True)])
+    weight = score / np.maximum(variance, 0.01)
+    places = _clusters(feature, score, least)
+    means = np.array([_mean(points[p], weight[p]) for p in places]).reshape(-1, *points.shape[1:])
+    for _ in range(2):
+        if not len(means):
+            break
+        means = _apart(means)
+        distance, owner = _nearest(features(means), feature)
+        groups = [np.flatnonzero((owner == k) & (distance <= NEAR)) for k in range(len(means))]
+        groups = [g for g in groups if len(g) and score[g].sum() >= least]
+        means = np.array([_mean(points[g], weight[g]) for g in groups])
+        means = means.reshape(-1, *points.shape[1:])
+    return means
+
+
+def _nearest(places: Array, feature: Array) -> tuple[Array, Int]:
+    from scipy.spatial import cKDTree
+
+    distance, index = cKDTree(places).query(feature)
+    return distance, index
+
+
+def _clusters(feature: Array, score: Array, least: float) -> list[Int]:
+    """Groups of detections around those with most support, best first, each one used once."""
+    from scipy.spatial import cKDTree
+
+    near = [np.asarray(k) for k in cKDTree(feature).query_ball_point(feature, 0.7 * NEAR)]
+    free = np.ones(len(feature), bool)
+    support = np.array([score[k].sum() for k in near])
+    out = []
+    for k in np.argsort(-support, kind="stable"):
+        if not free[k]:
+            continue
+        group = near[k][free[near[k]]]
+        if score[group].sum() < least:
+            continue
+        free[group] = False
+        out.append(group)
+    return out
+
+
+def _mean(rings: Array, weight: Array) -> Array:
+    """Weighted mean ring: aligned to the heaviest one, then to their mean."""
+    reference = rings[int(weight.argmax())]
+    for _ in range(2):
+        aligned = np.stack([align(r, reference) for r in rings])
+        reference = (aligned * weight[:, None, None]).sum(0) / weight.sum()
+    return reference
+
+
+def _apart(means: Array) -> Array:
+    """Means without those that overlap an earlier (better supported) one by a third."""
+    shapes = [polygon(m) for m in means]
+    keep: list[int] = []
+    for k, shape in enumerate(shapes):
+        if all(overlap(shape, shapes[j]) < 0.3 for j in keep):
+            keep.append(k)
+    return means[keep]
+
+
+def _ring_views(places: Array, traversal: Traversal) -> tuple[Views, Array]:
+    """Frames that could see each ring, and the weight of each view."""
+    n = len(places)
+    outline = places[:, :: max(places.shape[1] // 16, 1)]
+    points = np.concatenate([outline, places.mean(axis=1, keepdims=True)], axis=1)
+    per = points.shape[1]
+    seen = views(
+        points.reshape(-1, 2),
+        traversal.pose,
+        traversal.range_m,
+        traversal.occluders,
+        margin=RING_MARGIN,
+    )
+    key = seen.frame * n + seen.point // per
+    keys, inverse = np.unique(key, return_inverse=True)
+    share = np.bincount(inverse, minlength=len(keys)) / per
+    distance = np.bincount(inverse, seen.distance) / np.bincount(inverse) if len(keys) else share
+    ok = share >= VISIBLE
+    whole = Views(keys[ok] // n, keys[ok] % n, distance[ok])
+    return whole, share[ok] * view_weight(distance[ok])
+
+
+def ring_counts(
+    places: Array,
+    ids: Sequence[str],
+    traversals: Sequence[Traversal],
+    drives: Sequence[Rings],
+) -> list[DriveCounts]:
+    """Counts of every drive on closed elements ``places`` (n, 80, 2) with element ``ids``."""
+    n = len(places)
+    row = {name: k for k, name in enumerate(ids)}
+    counts: list[DriveCounts] = []
+    for traversal, rings in zip(traversals, drives, strict=True):
+        seen, weight = _ring_views(places, traversal)
+        owner = match(rings, places)
+        hit = owner >= 0
+        asked = traversal.asked
+        known = np.array([row.get(name, -1) for name in asked.element_id], np.int64)
+        key = np.concatenate(
+            [rings.frame[hit] * n + owner[hit], (asked.frame * n + known)[known >= 0]]
+        )
+        value = np.concatenate([rings.score[hit], asked.existence[known >= 0]])
+        counts.append(count(n, traversal, seen, weight, key, value))
+    return counts

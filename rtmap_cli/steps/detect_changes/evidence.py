@@ -1,0 +1,276 @@
+"""From traversals and a prior map to the evidence about every element, old and new."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.polylines import is_ring, length
+from rtmap_cli.geometry.rings import close, open_ring
+from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
+from rtmap_cli.maps.evidence import Counts, Evidence, Policy, Settings, Stretch
+from rtmap_cli.maps.existence import (
+    LIMIT,
+    PRIOR_LOG_ODDS,
+    runs_of,
+    stretches,
+)
+from rtmap_cli.maps.stations import Stations, stations_of
+from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, ring_counts
+from rtmap_cli.steps.detect_changes.lines import (
+    all_line_counts,
+    class_samples,
+    new_lines,
+    refit_lines,
+)
+from rtmap_cli.steps.detect_changes.votes import Ballot, ballot
+
+Array = NDArray[np.float64]
+
+
+def gather_evidence(
+    traversals: Sequence[Traversal],
+    prior: VectorMap,
+    classes: Sequence[str],
+    settings: Settings | None = None,
+    fused: Collection[str] = (),
+) -> list[Evidence]:
+    """Evidence on every prior element of ``classes`` and on every new candidate.
+
+    Traversals are put in order of their run ids, so that their order does not matter. Elements
+    come in the order of the map, new ones after them, class by class. Runs in ``fused`` are part
+    of the prior already: they speak for new candidates only.
+    """
+    settings = settings or Settings()
+    traversals = sorted(traversals, key=lambda t: t.run_id)
+    fresh = np.array([t.run_id not in fused for t in traversals], bool)
+    out: list[Evidence] = []
+    for name in classes:
+        judge = _rings if name in RING_CLASSES else _lines
+        out += judge(name, traversals, fresh, prior.of_class(name), settings)
+    return out
+
+
+def prior_log_odds(element: Element) -> float:
+    """Log-odds before the runs: the element's own where it has a history, else the usual one."""
+    history = element.traversals > 0 or element.existence != 0.0
+    return float(element.existence) if history else PRIOR_LOG_ODDS
+
+
+def new_id(class_name: str, geometry: Array) -> str:
+    """An id from class and place (to half a metre): the same find gets the same id again."""
+    place = np.round(np.asarray(geometry)[:, :2].mean(axis=0) * 2) / 2
+    size = round(length(geometry))
+    text = f"{class_name} {place[0]:.1f} {place[1]:.1f} {size}"
+    return f"{class_name}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
+
+
+# ---- lines
+
+
+def _lines(
+    name: str,
+    traversals: Sequence[Traversal],
+    fresh: NDArray[np.bool_],
+    prior: list[Element],
+    settings: Settings,
+) -> list[Evidence]:
+    runs, policy = [t.run_id for t in traversals], settings.policy
+    samples = [class_samples(t, name) for t in traversals]
+    old = [e.xy for e in prior]
+    found = new_lines(name, stations_of(old), traversals, samples)
+    for _ in range(2):
+        found = refit_lines(found, old, traversals, samples, settings.fusion)
+    for last in (False, True):
+        stations = stations_of([*old, *found])
+        if not len(stations):
+            return []
+        ids = [e.element_id for e in prior] + [""] * len(found)
+        counts = all_line_counts(stations, ids, traversals, samples, policy.view_margin_m)
+        before = int(np.searchsorted(stations.line, len(old)))
+        votes = ballot(counts, runs, settings.votes, fresh, before)
+        if last:
+            break
+        # What is left of the candidates competes once more, without those that were refuted.
+        found = _supported(found, len(old), stations, votes, policy)
+    out = [_line_evidence(e, k, stations, votes, settings) for k, e in enumerate(prior)]
+    for k, line in enumerate(found):
+        element = Element(new_id(name, line), name, line)
+        out.append(_line_evidence(element, len(old) + k, stations, votes, settings, new=True))
+    return out
+
+
+def _supported(
+    found: list[Array], before: int, stations: Stations, votes: Ballot, policy: Policy
+) -> list[Array]:
+    """The stretches of candidates that the votes bear out, each a line of its own."""
+    out = []
+    evidence = votes.evidence
+    for k, line in enumerate(found):
+        index = stations.of_line(before + k)
+        ring = is_ring(line)
+        real = stretches(
+            evidence[index],
+            stations.spacing[index] / policy.correlation_m,
+            policy.new_log_odds,
+            policy.switch,
+            ring,
+        )
+        if ring and real.all():
+            out.append(stations.xy[index])
+            continue
+        for run in runs_of(real, ring):
+            piece = stations.xy[index[run]]
+            if len(piece) > 1 and length(piece) >= policy.shortest_m:
+                out.append(piece)
+    return out
+
+
+def _line_evidence(
+    element: Element,
+    k: int,
+    stations: Stations,
+    votes: Ballot,
+    settings: Settings,
+    new: bool = False,
+) -> Evidence:
+    policy = settings.policy
+    index = stations.of_line(k)
+    ring = is_ring(element.points)
+    before = policy.new_log_odds if new else prior_log_odds(element)
+    evidence = votes.evidence[index]
+    looked = votes.views[index] > 0
+    real = np.ones(len(index), bool)
+    if not new:
+        # The prior log-odds of an element speak for its length as one vote does.
+        weight = stations.spacing[index] / policy.correlation_m
+        real = stretches(np.where(looked, evidence, 0.0), weight, before, policy.switch, ring)
+    parts = []
+    for flag in (True, False):
+        for run in runs_of(real == flag, ring and not real.all() and real.any()):
+            parts.append(_stretch(element, stations, votes, index, run, flag, before, policy))
+    parts = _without_slivers(parts, policy)
+    mean = _mean_evidence(evidence, stations.spacing[index], looked)
+    return Evidence(
+        element,
+        sorted(parts, key=lambda p: p.start),
+        new,
+        votes.counts(index[looked]),
+        mean,
+        votes.votes[:, index],
+        votes.hits[index],
+        votes.views[index],
+        votes.in_view[:, index].sum(axis=0).astype(np.float64),
+    )
+
+
+def _mean_evidence(evidence: Array, spacing: Array, looked: NDArray[np.bool_]) -> float:
+    """Mean over the stations that were looked at; stretches nobody saw say nothing."""
+    if not looked.any():
+        return 0.0
+    weight = np.maximum(spacing, 1e-6)[looked]
+    return float((evidence[looked] * weight).sum() / weight.sum())
+
+
+def _stretch(
+    element: Element,
+    stations: Stations,
+    votes: Ballot,
+    index: NDArray[np.int64],
+    run: NDArray[np.int64],
+    exists: bool,
+    before: float,
+    policy: Policy,
+) -> Stretch:
+    places = index[run]
+    looked = votes.views[places] > 0
+    ratio = _mean_evidence(votes.evidence[places], stations.spacing[places], looked)
+    # Short stretches are less than one vote.
+    extent = float(stations.spacing[places].sum())
+    ratio *= min(1.0, max(extent / policy.correlation_m, 0.3))
+    whole = len(run) == len(index)
+    geometry = element.points if whole else _cut_out(element.points, stations, places)
+    odds = float(np.clip(before + ratio, -LIMIT, LIMIT))
+    counts = votes.counts(places[looked])
+    return Stretch(exists, odds, ratio, geometry, counts, int(run[0]), int(run[-1]))
+
+
+def _cut_out(points: Array, stations: Stations, places: NDArray[np.int64]) -> Array:
+    """The part of a line between two of its stations, with its own vertices in between."""
+    from rtmap_cli.geometry.polylines import arc_length
+
+    at = arc_length(points)
+    a, b = float(stations.s[places[0]]), float(stations.s[places[-1]])
+    if b <= a:
+        # The stretch runs over the start of a ring.
+        turned = np.concatenate([points, points[1:]])
+        at = np.concatenate([at, at[1:] + at[-1]])
+        b += float(at[len(points) - 1])
+        points = turned
+    inside = (at > a + 1e-9) & (at < b - 1e-9)
+    ends = [
+        np.array([np.interp(x, at, points[:, k]) for k in range(points.shape[1])]) for x in (a, b)
+    ]
+    return np.concatenate([ends[0][None], points[inside], ends[1][None]])
+
+
+def _without_slivers(parts: list[Stretch], policy: Policy) -> list[Stretch]:
+    """Absent stretches too short to be told of join what is beside them (nothing is cut)."""
+    if all(p.exists for p in parts):
+        return parts
+    gone = [p for p in parts if not p.exists and length(p.geometry) >= policy.shortest_m]
+    whole = len(parts) == 1
+    if whole or gone:
+        return [p for p in parts if p.exists or p in gone or whole]
+    return [p for p in parts if p.exists]
+
+
+# ---- closed elements
+
+
+def _rings(
+    name: str,
+    traversals: Sequence[Traversal],
+    fresh: NDArray[np.bool_],
+    prior: list[Element],
+    settings: Settings,
+) -> list[Evidence]:
+    drives = [class_rings(t, name) for t in traversals]
+    old = np.array([open_ring(e.xy) for e in prior]).reshape(-1, 80, 2)
+    found = new_rings(old, drives).reshape(-1, 80, 2)
+    places = np.concatenate([old, found])
+    if not len(places):
+        return []
+    elements = list(prior) + [Element(new_id(name, r), name, close(r)) for r in found]
+    ids = [e.element_id for e in elements]
+    counts = ring_counts(places, ids, traversals, drives)
+    runs = [t.run_id for t in traversals]
+    votes = ballot(counts, runs, settings.votes, fresh, len(prior))
+    return [
+        _ring_evidence(e, k, votes, settings, new=k >= len(prior)) for k, e in enumerate(elements)
+    ]
+
+
+def _ring_evidence(
+    element: Element, k: int, votes: Ballot, settings: Settings, new: bool
+) -> Evidence:
+    before = settings.policy.new_log_odds if new else prior_log_odds(element)
+    ratio = float(votes.evidence[k]) if votes.views[k] > 0 else 0.0
+    odds = float(np.clip(before + ratio, -LIMIT, LIMIT))
+    index = np.array([k])
+    counts = votes.counts(index) if votes.views[k] > 0 else Counts()
+    return Evidence(
+        element,
+        [Stretch(new or odds > 0, odds, ratio, element.points, counts)],
+        new,
+        counts,
+        ratio,
+        votes.votes[:, index],
+        votes.hits[index],
+        votes.views[index],
+        votes.in_view[:, index].sum(axis=0).astype(np.float64),
+    )

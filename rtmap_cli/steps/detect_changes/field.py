@@ -1,0 +1,133 @@
+"""The density field of what the prior does not explain: where many drives saw a line.
+
+Per drive Σ score · N(distance across the line; σ) over its detections, divided by the number of
+frames that could see the cell; then the mean over the drives that looked: one vote per drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.visibility import views
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+CELL = 0.2
+"""Size of a cell, metres."""
+BLOCK = 640
+"""Cells of a block's side: memory is bounded by a block, not by the map."""
+MARGIN = 24
+"""Cells around a block that are computed but not used, wider than any kernel."""
+COARSE = 10
+"""Cells per side of a square whose views are counted once."""
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Line samples of one drive: ``xy`` (n, 2), unit ``tangent`` (n, 2), ``spacing`` (n,) metres of
+    line that each stands for, ``sigma`` (n,) across the line (m), ``score`` (n,)."""
+
+    xy: Array
+    tangent: Array
+    spacing: Array
+    sigma: Array
+    score: Array
+
+    def select(self, index: NDArray[np.bool_]) -> Marks:
+        """Some of the samples."""
+        return Marks(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+def deposits(marks: Marks, widest: float = 1.2) -> tuple[Int, Array]:
+    """Cells (n, 2) and masses (n,) of line samples, each N(0, sigma²) across its line.
+
+    Samples farther apart than a cell are repeated along their tangents. ``sigma`` above
+    ``widest`` (m) is taken as that: wider bells say nothing and cost most.
+    """
+    spacing, tangent = marks.spacing, marks.tangent
+    repeat = np.maximum(np.ceil(spacing / CELL), 1).astype(np.int64)
+    row = np.repeat(np.arange(len(spacing)), repeat)
+    k = np.arange(len(row)) - np.repeat(np.cumsum(repeat) - repeat, repeat)
+    shift = ((k + 0.5) / repeat[row] - 0.5) * spacing[row]
+    p = marks.xy[row] + shift[:, None] * tangent[row]
+    normal = np.stack([-tangent[row, 1], tangent[row, 0]], axis=-1)
+    s = np.clip(marks.sigma[row], CELL, widest)
+    u = np.linspace(-2.4, 2.4, 17)
+    bell = np.exp(-0.5 * u**2)
+    bell /= bell.sum()
+    cell = np.floor((p[:, None] + (s[:, None] * u)[..., None] * normal[:, None]) / CELL)
+    mass = (marks.score[row] * spacing[row] / repeat[row])[:, None] * bell / CELL**2
+    return cell.reshape(-1, 2).astype(np.int64), mass.ravel()
+
+
+def _coarse_views(coarse: Int, traversal: Traversal) -> Array:
+    """(n,) frames of a drive that could see the middles of coarse squares (n, 2)."""
+    middle = (coarse + 0.5) * COARSE * CELL
+    seen = views(middle, traversal.pose, traversal.range_m, traversal.occluders, margin=1.0)
+    return np.bincount(seen.point, minlength=len(coarse)).astype(np.float64)
+
+
+def blocks(
+    drives: Sequence[Marks], traversals: Sequence[Traversal]
+) -> Iterator[tuple[Int, Int, Array]]:
+    """Yield block, first cell and field of every block near samples; the field has a margin.
+
+    The field is in hits per view and metre: a line that every frame sees with score 1 and
+    negligible σ would be infinitely high, with σ it is 1 / (√(2π) σ).
+    """
+    side, room = BLOCK * CELL, MARGIN * CELL
+    where = np.concatenate([d.xy for d in drives]) if drives else np.zeros((0, 2))
+    used = np.unique(np.floor(where / side).astype(np.int64) @ np.array([1 << 32, 1]))
+    for key in used:
+        # The low half of the key is signed.
+        y = int((key + (1 << 31)) % (1 << 32)) - (1 << 31)
+        block = np.array([(int(key) - y) >> 32, y])
+        low, high = block * side - room, (block + 1) * side + room
+        near = [d.select(((d.xy >= low) & (d.xy < high)).all(axis=1)) for d in drives]
+        places = np.concatenate([d.xy for d in near])
+        # Only the part of the block that holds anything, with room for the kernels.
+        first = np.maximum(places.min(axis=0) - room, low)
+        last = np.minimum(places.max(axis=0) + room, high)
+        start = np.floor(first / CELL).astype(np.int64)
+        shape = np.ceil(last / CELL).astype(np.int64) - start
+        yield block, start, _mean_field(near, traversals, start, shape)
+
+
+def _mean_field(
+    drives: list[Marks], traversals: Sequence[Traversal], start: Int, shape: Int
+) -> Array:
+    """Mean over the drives of deposits per view, (rows y, columns x)."""
+    width, height = int(shape[0]), int(shape[1])
+    coarse_shape = (height // COARSE + 2, width // COARSE + 2)
+    total = np.zeros((height, width))
+    weight = np.zeros(coarse_shape)
+    base = start // COARSE
+    # The squares of the grid need not start with the field: what is left over is cut.
+    cut = start - base * COARSE
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in coarse_shape[::-1])), axis=-1)
+    squares = grid.reshape(-1, 2) + base
+    for marks, traversal in zip(drives, traversals, strict=True):
+        looked = _coarse_views(squares, traversal).reshape(coarse_shape)
+        trust = np.clip((looked - 1) / 3, 0, 1)
+        weight += trust
+        if not len(marks.score):
+            continue
+        cell, mass = deposits(marks)
+        x, y = (cell - start).T
+        ok = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        field = np.bincount(y[ok] * width + x[ok], mass[ok], height * width)
+        scale = _fine(trust / np.maximum(looked, 2.0), cut, height, width)
+        total += field.reshape(height, width) * scale
+    return total / np.maximum(_fine(weight, cut, height, width), 0.5)
+
+
+def _fine(coarse: Array, cut: Int, height: int, width: int) -> Array:
+    """A coarse grid repeated to cells, without the ``cut`` cells before the field."""
+    fine = np.repeat(np.repeat(coarse, COARSE, axis=0), COARSE, axis=1)
+    return fine[cut[1] : cut[1] + height, cut[0] : cut[0] + width]

@@ -1,0 +1,161 @@
+"""Lines: what the drives say about prior ones, and new ones that the prior does not explain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.logs.traversal import Traversal, pose_variance
+from rtmap_cli.maps.refit import (
+    FusionModel,
+    combine,
+    drive_offsets,
+    measured_share,
+    solve_vertices,
+)
+from rtmap_cli.maps.stations import (
+    Samples,
+    Stations,
+    assign,
+    loose_stretches,
+    samples_of,
+    smoother,
+    stations_of,
+)
+from rtmap_cli.steps.detect_changes.field import BLOCK, CELL, Marks, blocks
+from rtmap_cli.steps.detect_changes.ridges import (
+    RidgePoints,
+    join_collinear,
+    ridge_points,
+    trace,
+)
+from rtmap_cli.steps.detect_changes.votes import DriveCounts, line_counts
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+SHORTEST = 3.0
+"""Shorter pieces of detections (m) are not candidates for new lines."""
+BLUR = {"boundary": 1.0}
+"""Blur of the field in median sigmas; classes without close parallels bear more."""
+USUAL_BLUR = 0.45
+HIGH, LOW = 0.20, 0.06
+"""Ridges start and end at these shares of the height that a steady line would have."""
+JOIN_GAP, JOIN_ANGLE = 6.0, float(np.radians(25))
+"""Ends of new lines that look at each other are joined over such a gap (m)."""
+CORNER = {"boundary": 5.0}
+"""Longest extension (m) of two ends to a common corner."""
+
+
+def class_samples(traversal: Traversal, class_name: str) -> Samples:
+    """Samples of a drive's detections of one class in the map frame."""
+    index = np.flatnonzero(traversal.class_name == class_name)
+    return samples_of(
+        traversal.points[index],
+        traversal.covariance[index],
+        traversal.score[index],
+        traversal.frame[index],
+    )
+
+
+def _across(samples: Samples) -> Array:
+    """(n,) standard deviation across the detection itself, metres."""
+    normal = np.stack([-samples.tangent[:, 1], samples.tangent[:, 0]], axis=-1)
+    return np.sqrt(np.einsum("ni,nij,nj->n", normal, samples.covariance, normal))
+
+
+def new_lines(
+    class_name: str,
+    prior: Stations,
+    traversals: Sequence[Traversal],
+    samples: Sequence[Samples],
+) -> list[Array]:
+    """Polylines (n, 2) where detections that no prior line explains agree; not yet judged."""
+    drives = []
+    for s in samples:
+        _, taken = assign(prior, s)
+        k = loose_stretches(s, taken, SHORTEST)
+        drives.append(Marks(s.xy[k], s.tangent[k], s.spacing[k], _across(s)[k], s.score[k]))
+    widths = np.concatenate([d.sigma for d in drives])
+    if not len(widths):
+        return []
+    median = float(np.median(widths))
+    blur = float(np.clip(BLUR.get(class_name, USUAL_BLUR) * median, CELL, 0.9))
+    spread = np.sqrt(2 * median**2 + blur**2)
+    score = float(np.mean(np.concatenate([d.score for d in drives])))
+    steady = 0.5 * score / (np.sqrt(2 * np.pi) * spread)
+    points = _all_ridge_points(drives, traversals, blur, LOW * steady)
+    if points is None:
+        return []
+    lines = trace(points, HIGH * steady, SHORTEST)
+    return join_collinear(lines, JOIN_GAP, JOIN_ANGLE, CORNER.get(class_name, 0.0))
+
+
+def _all_ridge_points(
+    drives: Sequence[Marks], traversals: Sequence[Traversal], blur: float, low: float
+) -> RidgePoints | None:
+    parts = []
+    for block, first, field in blocks(drives, traversals):
+        points = ridge_points(field, first, CELL, blur, low)
+        # A block keeps the points of its own square; the margin belongs to its neighbours.
+        parts.append(points.select((points.cell // BLOCK == block).all(axis=1)))
+    return RidgePoints.concatenate(parts) if parts else None
+
+
+def refit_lines(
+    lines: list[Array],
+    others: list[Array],
+    traversals: Sequence[Traversal],
+    samples: Sequence[Samples],
+    model: FusionModel,
+) -> list[Array]:
+    """New lines moved to where their detections put them, ``others`` competing for detections."""
+    if not lines:
+        return []
+    stations = stations_of([*others, *lines])
+    offset, variance = fused_offsets(stations, traversals, samples, model)
+    mine = stations.line >= len(others)
+    start = np.tile(np.eye(2) * 1.0, (int(mine.sum()), 1, 1))
+    moved, _ = solve_vertices(
+        stations.xy[mine], stations.chain[mine], start, stations, offset, variance, 1.2
+    )
+    # A jump is a wrong assignment, not a correction.
+    size = np.hypot(*moved.T)
+    moved *= np.minimum(1.0, 1.0 / np.maximum(size, 1e-9))[:, None]
+    xy = stations.xy[mine] + moved
+    return [xy[stations.line[mine] == k + len(others)] for k in range(len(lines))]
+
+
+def fused_offsets(
+    stations: Stations,
+    traversals: Sequence[Traversal],
+    samples: Sequence[Samples],
+    model: FusionModel,
+) -> tuple[Array, Array]:
+    """Offset and variance of every station over all drives (NaN, inf where none)."""
+    smooth = smoother(stations, model.width)
+    drives = []
+    for traversal, s in zip(traversals, samples, strict=True):
+        feet, _ = assign(stations, s)
+        noise = pose_variance(
+            traversal, s.frame[feet.sample], s.xy[feet.sample], stations.normal[feet.station]
+        )
+        drives.append(drive_offsets(stations, smooth, s, feet, noise, model))
+    return combine(drives, measured_share(drives, model), model)
+
+
+def all_line_counts(
+    stations: Stations,
+    ids: Sequence[str],
+    traversals: Sequence[Traversal],
+    samples: Sequence[Samples],
+    margin: float,
+) -> list[DriveCounts]:
+    """Counts of every drive at all stations; every detection goes to one line only."""
+    counts = []
+    for traversal, s in zip(traversals, samples, strict=True):
+        feet = assign(stations, s)[0]
+        counts.append(line_counts(stations, ids, traversal, s, feet, margin))
+    return counts

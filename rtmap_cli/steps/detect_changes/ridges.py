@@ -1,0 +1,225 @@
+"""Centre lines of a density field: sub-cell ridge points, linked into polylines.
+
+Ridge points after Steger, "An unbiased detector of curvilinear structures" (1998): along the
+direction of the strongest negative second derivative the first derivative vanishes inside the
+cell. Points are kept sparse, so that a field may be computed block by block and linked at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.polylines import length
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class RidgePoints:
+    """``xy`` (n, 2) m, ``direction`` (n, 2) unit vectors along the ridge (sign free), ``value``
+    (n,) of the field, ``cell`` (n, 2) integer cell of the whole grid."""
+
+    xy: Array
+    direction: Array
+    value: Array
+    cell: Int
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def select(self, index: NDArray[np.bool_]) -> RidgePoints:
+        """Some of the points."""
+        return RidgePoints(
+            self.xy[index], self.direction[index], self.value[index], self.cell[index]
+        )
+
+    @staticmethod
+    def concatenate(parts: list[RidgePoints]) -> RidgePoints:
+        """Points of several blocks."""
+        names = ("xy", "direction", "value", "cell")
+        return RidgePoints(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+
+
+def ridge_points(
+    field: Array, first_cell: Int, cell: float, blur: float, low: float
+) -> RidgePoints:
+    """Ridge points of ``field`` (rows y, columns x) where it is at least ``low``.
+
+    ``first_cell`` (2,) is the integer cell (x, y) of ``field[0, 0]`` in the whole grid, ``cell``
+    its size (m), ``blur`` (m) the Gaussian scale of the derivatives.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    scale = max(blur / cell, 0.8)
+
+    def derivative(y: int, x: int) -> Array:
+        out: Array = gaussian_filter(field, scale, order=(y, x), mode="constant")
+        return out
+
+    value = derivative(0, 0)
+    rows, columns = np.nonzero(value >= low)
+    gx, gy = derivative(0, 1)[rows, columns], derivative(1, 0)[rows, columns]
+    xx, yy = derivative(0, 2)[rows, columns], derivative(2, 0)[rows, columns]
+    xy = derivative(1, 1)[rows, columns]
+    # Eigenvector of the most negative eigenvalue of [[xx, xy], [xy, yy]].
+    half, mean = np.hypot((xx - yy) / 2, xy), (xx + yy) / 2
+    curvature = mean - half
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy) + np.pi / 2
+    nx, ny = np.cos(angle), np.sin(angle)
+    t = -(gx * nx + gy * ny) / np.where(curvature < -1e-15, curvature, -1e-15)
+    ok = (curvature < -1e-12) & (np.abs(t * nx) <= 0.6) & (np.abs(t * ny) <= 0.6)
+    rows, columns, t, nx, ny = rows[ok], columns[ok], t[ok], nx[ok], ny[ok]
+    index = np.stack([columns, rows], axis=-1) + first_cell
+    place = (index + 0.5 + np.stack([t * nx, t * ny], -1)) * cell
+    return RidgePoints(
+        place,
+        np.stack([-ny, nx], axis=-1),
+        value[rows, columns],
+        index.astype(np.int64),
+    )
+
+
+def trace(points: RidgePoints, high: float, shortest: float) -> list[Array]:
+    """Link ridge points into polylines (n, 2): start at the strongest, follow both directions.
+
+    A line starts at ``high`` or more and goes on to the edge of the points; lines shorter than
+    ``shortest`` (m) are dropped. A line that runs into another ends there.
+    """
+    where = {(int(x), int(y)): k for k, (x, y) in enumerate(points.cell)}
+    owner = np.full(len(points), -1)
+    lines: list[Array] = []
+    for seed in np.lexsort((points.cell[:, 1], points.cell[:, 0], -points.value)):
+        if points.value[seed] < high:
+            break
+        if owner[seed] >= 0:
+            continue
+        owner[seed] = len(lines)
+        ahead = _walk(points, where, owner, int(seed), points.direction[seed], len(lines))
+        behind = _walk(points, where, owner, int(seed), -points.direction[seed], len(lines))
+        line = _smooth(points.xy[[*behind[::-1], int(seed), *ahead]])
+        lines.append(line)
+    return [line for line in lines if len(line) > 1 and length(line) >= shortest]
+
+
+_NEAR = [(x, y) for x in range(-2, 3) for y in range(-2, 3) if (x, y) != (0, 0)]
+
+
+def _walk(
+    points: RidgePoints,
+    where: dict[tuple[int, int], int],
+    owner: Int,
+    start: int,
+    direction: Array,
+    name: int,
+) -> list[int]:
+    """Indices of the ridge points that follow ``start`` in ``direction``."""
+    path: list[int] = []
+    here, d = start, direction
+    while True:
+        x, y = points.cell[here]
+        found = [k for dx, dy in _NEAR if (k := where.get((int(x) + dx, int(y) + dy))) is not None]
+        if not found:
+            return path
+        index = np.array(found)
+        step = points.xy[index] - points.xy[here]
+        forward = step @ d
+        beside = np.abs(step[:, 0] * d[1] - step[:, 1] * d[0])
+        turn = np.abs(points.direction[index] @ d)
+        ok = (forward > 0) & (beside < 1.2 * forward) & (turn > 0.6) & (owner[index] != name)
+        if not ok.any():
+            return path
+        cost = np.where(ok, forward + 2 * beside + (1 - turn), np.inf)
+        nearest = int(index[cost.argmin()])
+        # What lies beside the step belongs to the same ridge: it must not start a line.
+        swallowed = index[(np.abs(forward) < 0.5) & (turn > 0.8) & (owner[index] < 0)]
+        path.append(nearest)
+        if owner[nearest] >= 0:
+            return path
+        owner[swallowed] = name
+        owner[nearest] = name
+        sign = 1.0 if points.direction[nearest] @ d > 0 else -1.0
+        here, d = nearest, sign * points.direction[nearest]
+
+
+def _smooth(line: Array, sigma: float = 2.0) -> Array:
+    """The steps of a few cells taken out of a traced line; its ends stay."""
+    from scipy.ndimage import gaussian_filter1d
+
+    if len(line) < 5:
+        return line
+    out = gaussian_filter1d(line, sigma, axis=0, mode="nearest")
+    out[0], out[-1] = line[0], line[-1]
+    return out
+
+
+def _ends(lines: list[Array]) -> tuple[Array, Array]:
+    """(2n, 2) end points and outward directions over the last four metres of each line."""
+    place, outward = [], []
+    for line in lines:
+        for points in (line[::-1], line):
+            far = np.hypot(*(points - points[-1]).T)
+            inner = points[np.flatnonzero(far > 0.4)] if (far > 0.4).any() else points[:1]
+            back = inner[np.hypot(*(inner - points[-1]).T) <= 4.0]
+            base = back[0] if len(back) else inner[-1]
+            d = points[-1] - base
+            place.append(points[-1])
+            outward.append(d / max(np.hypot(*d), 1e-9))
+    return np.array(place).reshape(-1, 2), np.array(outward).reshape(-1, 2)
+
+
+def join_collinear(
+    lines: list[Array], gap: float, angle: float, corner: float = 0.0
+) -> list[Array]:
+    """Join lines whose ends look at each other: at most ``gap`` m apart, ``angle`` rad off.
+
+    With ``corner`` > 0 (m) ends that meet at a corner are extended to where their tangents
+    cross, if that is at most so far from both (boundaries turn sharply at junctions).
+    """
+    from scipy.spatial import cKDTree
+
+    lines = list(lines)
+    while len(lines) > 1:
+        place, outward = _ends(lines)
+        pairs = cKDTree(place).query_pairs(max(gap, 1.5 * corner), output_type="ndarray")
+        best: tuple[float, int, int, Array | None] | None = None
+        for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))] if len(pairs) else []:
+            if a // 2 == b // 2:
+                continue
+            found = _join_cost(place[a], outward[a], place[b], outward[b], gap, angle, corner)
+            if found is not None and (best is None or found[0] < best[0]):
+                best = (found[0], int(a), int(b), found[1])
+        if best is None:
+            break
+        _, a, b, middle = best
+        first = lines[a // 2] if a % 2 else lines[a // 2][::-1]
+        second = lines[b // 2][::-1] if b % 2 else lines[b // 2]
+        parts = [first, second] if middle is None else [first, middle[None], second]
+        merged = np.concatenate(parts)
+        lines = [x for k, x in enumerate(lines) if k not in (a // 2, b // 2)] + [merged]
+    return lines
+
+
+def _join_cost(
+    p: Array, d: Array, q: Array, e: Array, gap: float, angle: float, corner: float
+) -> tuple[float, Array | None] | None:
+    """Cost of joining two ends, with the corner between them or None; None when they do not."""
+    step = q - p
+    far = float(np.hypot(*step))
+    facing = float(-(d @ e))
+    if far <= gap and facing >= np.cos(angle):
+        if far < 0.6:
+            return far, None
+        if min(d @ step, -(e @ step)) / far >= np.cos(angle):
+            return far, None
+    if corner > 0 and -0.5 < facing < np.cos(angle):
+        cross = d[0] * e[1] - d[1] * e[0]
+        if abs(cross) > 0.3:
+            a = (step[0] * e[1] - step[1] * e[0]) / cross
+            b = (step[0] * d[1] - step[1] * d[0]) / cross
+            if -0.7 <= a <= corner and -0.7 <= b <= corner:
+                return corner + abs(a) + abs(b), p + a * d
+    return None
