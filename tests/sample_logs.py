@@ -58,7 +58,7 @@ def write_native_log(folder: Path, frames: int = 4, cameras: int = 2) -> Path:
             )
             names = [f"cam_{k}" for k in range(1 if i == 1 else cameras)]
             sweep = np.arange(12, dtype=float).reshape(3, 4) / 12 if i == 0 else None
-            writer.add(frame, {n: jpeg(40 * i + 10) for n in names}, sweep=sweep)
+            writer.add(frame, {n: jpeg((40 * i + 10) % 250) for n in names}, sweep=sweep)
         writer.write_truth(true_poses(np.arange(frames), times, pose), {"changes": []})
         writer.close()
     return folder

@@ -137,20 +137,32 @@ def _transforms(table: pa.Table, path: Path) -> Array:
     return se3_from_quaternion(q, t)
 
 
+def _pose_table(folder: Path) -> tuple[pa.Table, Times]:
+    path = folder / POSES_FILE
+    table = read_feather(path, ["timestamp_ns", *_QUATERNION, *_TRANSLATION])
+    return table, table["timestamp_ns"].to_numpy(zero_copy_only=False).astype(np.int64)
+
+
+def read_poses_raw(folder: Path) -> tuple[Times, Array, Array]:
+    """Times (n,), quaternions (n, 4) and city positions (n, 3) as they are, for a checker."""
+    path = folder / POSES_FILE
+    table, times = _pose_table(folder)
+    return times, _numbers(table, _QUATERNION, path), _numbers(table, _TRANSLATION, path)
+
+
 def read_poses(folder: Path) -> tuple[Times, Array]:
     """Times (n,) and city_SE3_ego (n, 4, 4) of a log; BadInput unless times rise strictly."""
     path = folder / POSES_FILE
-    table = read_feather(path, ["timestamp_ns", *_QUATERNION, *_TRANSLATION])
-    times = table["timestamp_ns"].to_numpy(zero_copy_only=False).astype(np.int64)
+    table, times = _pose_table(folder)
     if not len(times):
         raise BadInput(path, "holds no pose")
     step = np.diff(times)
-    if (step < 0).any():
-        row = int(np.flatnonzero(step < 0)[0]) + 1
-        raise BadInput(path, f"row {row} is earlier than the row before", "sort it by time")
-    if (step == 0).any():
-        row = int(np.flatnonzero(step == 0)[0]) + 1
-        raise BadInput(path, f"row {row} repeats the time of the row before", "drop duplicates")
+    for bad, what, todo in (
+        (step < 0, "is earlier than the row before", "sort it by time"),
+        (step == 0, "repeats the time of the row before", "drop duplicates"),
+    ):
+        if bad.any():
+            raise BadInput(path, f"row {int(np.flatnonzero(bad)[0]) + 1} {what}", todo)
     return times, _transforms(table, path)
 
 

@@ -15,6 +15,12 @@ from rtmap_cli.logs.log import Log
 READERS = {"av2": ("rtmap_cli.formats.av2", "Av2Log")}
 """Prefix of a log argument → module and class of its reader."""
 
+MARKS = {
+    "native": ("log.json", "frames.parquet"),
+    "av2": ("city_SE3_egovehicle.feather", "annotations.feather", "annotations_with_ego.feather"),
+}
+"""Files that tell a format, so that a log which lacks one of them is still named as what it is."""
+
 
 def log_format(spec: str | Path) -> tuple[str, Path]:
     """(``native`` or a key of READERS, folder) of a log argument.
@@ -31,10 +37,9 @@ def log_format(spec: str | Path) -> tuple[str, Path]:
         raise BadInput(folder, "no such log folder")
     if not folder.is_dir():
         raise BadInput(folder, "is a file, a log is a folder")
-    if (folder / "log.json").exists():
-        return "native", folder
-    if (folder / "city_SE3_egovehicle.feather").exists():
-        return "av2", folder
+    for kind, marks in MARKS.items():
+        if any((folder / mark).exists() for mark in marks):
+            return kind, folder
     what = "is an empty folder" if not any(folder.iterdir()) else "is not a log"
     raise BadInput(
         folder,
