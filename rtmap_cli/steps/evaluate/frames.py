@@ -20,7 +20,9 @@ from rtmap_cli.steps.evaluate.precision import Detection
 Array = NDArray[np.float64]
 
 MIN_LENGTH = 0.3
-"""Pieces of lines that a crop leaves shorter than this (m) are no elements of their own."""
+"""Pieces of lines that a crop leaves shorter than this (m) are no elements of their own …"""
+MIN_AREA = 0.5
+"""… nor are pieces of crossings smaller than this (m²); both as in the reference truth."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,11 @@ class MapSide:
     def crop(self, map_SE3_ego: Array, range_m: Range) -> list[Detection]:
         """Elements in range in the ego frame; pieces that meet end to end are one element."""
         least = 0.0 if self.scored else MIN_LENGTH
-        local = self.index.crop(map_SE3_ego, range_m, min_length=least)
+        local = [
+            e
+            for e in self.index.crop(map_SE3_ego, range_m, min_length=least)
+            if e.class_name not in RING_CLASSES or _area(e.points) >= MIN_AREA
+        ]
         if not self.scored:
             return [(e.class_name, e.points[:, :2], 1.0) for e in local]
         out: list[Detection] = []
@@ -118,6 +124,12 @@ class MapSide:
             rows = [(e.points[:, :2], probability(e.source)) for e in local if e.class_name == name]
             out += [(name, p, s) for p, s in (rows if name in RING_CLASSES else _joined(rows))]
         return out
+
+
+def _area(ring: Array) -> float:
+    """Area inside a closed ring, m² (shoelace)."""
+    x, y = (ring[:, :2] - ring[0, :2]).T
+    return float(abs((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) / 2)
 
 
 def probability(element: Element) -> float:
