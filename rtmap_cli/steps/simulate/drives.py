@@ -57,12 +57,12 @@ def drive_over_route(
     xyz = np.stack([np.interp(at, s, route[:, k]) for k in range(3)], axis=-1)
     headings = np.unwrap(np.arctan2(*np.gradient(route[:, :2], axis=0).T[::-1]))
     yaw = np.interp(at, s, headings)
-    side = lateral + LANE_SD * rng.normal()
+    place = lateral + LANE_SD * rng.normal()
     sway = WANDER_SD * first_order_walk(rng, at, WANDER_LENGTH, 1)[:, 0]
-    side = side + np.convolve(np.pad(sway, 4, mode="edge"), np.ones(9) / 9, mode="valid")
+    side = place + np.convolve(np.pad(sway, 4, mode="edge"), np.ones(9) / 9, mode="valid")
     jitter = rng.integers(-4_000_000, 4_000_001, len(at))
-    times = EPOCH_NS + (key.seed * 97 + key.traversal) % 3650 * DAY_NS
-    times = times + np.round(np.arange(len(at)) * 1e9 / rate).astype(np.int64) + jitter
+    first = EPOCH_NS + (key.seed * 97 + key.traversal) % 3650 * DAY_NS
+    times = first + np.round(np.arange(len(at)) * 1e9 / rate).astype(np.int64) + jitter
     x, y = xyz[:, 0] - side * np.sin(yaw), xyz[:, 1] + side * np.cos(yaw)
     return Drive(name, crs, times, se3_from_xyyaw(x, y, yaw, xyz[:, 2]))
 

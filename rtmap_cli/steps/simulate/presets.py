@@ -72,7 +72,7 @@ class Preset:
     ghost_score: tuple[float, float] = (-0.3, 1.0)
     # sd of the log of what the network says about its own scale; 0: it states the true one.
     sigma_spread: float = 0.0
-    vehicles_per_drive: float = 9.0
+    vehicles_per_drive: float = 7.0
     # Initial pose: bias of the drive, drift (50 m) and white part, per axis; yaw bias and white.
     gnss: tuple[float, float, float] = (0.8, 0.3, 0.2)
     gnss_yaw_deg: tuple[float, float] = (0.8, 0.5)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rtmap_cli.geometry.polylines import (
-    arc_length,
     is_ring,
     length,
     resample_step,
@@ -180,9 +179,7 @@ class PriorPerception:
         along = tangent @ np.array([[c, -s], [s, c]])
         sd = self.start_sigma
         arm = along[:, 1] * placed[:, 0] - along[:, 0] * placed[:, 1]
-        total = np.sqrt(
-            (sd[0] * along[:, 0]) ** 2 + (sd[1] * along[:, 1]) ** 2 + (sd[2] * arm) ** 2
-        )
+        total = np.sqrt(((sd[:2] * along) ** 2).sum(-1) + (sd[2] * arm) ** 2)
         return places, kept * total[:, None] * np.abs(along)
 
     def new_pieces(self, view: View) -> list[SeenPiece]:

@@ -27,6 +27,7 @@ STRAIGHT_TURN = np.radians(25.0)
 TURNING_TURN = np.radians(60.0)
 MAX_ROUTES = 400
 """Routes of a kind that are kept; lane graphs of a few hundred metres have about as many."""
+MAX_COMPARED = 60
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,8 @@ def find_routes(lanes: Sequence[Lane], kind: str, length_m: float) -> list[Array
     by_id = {lane.lane_id: lane for lane in lanes}
     routes: list[Array] = []
     for lane in sorted(lanes, key=lambda lane: lane.lane_id):
-        stack = [((lane.lane_id,), float(arc_length(lane.points)[-1]))]
+        stack: list[tuple[tuple[str, ...], float]] = []
+        stack.append(((lane.lane_id,), float(arc_length(lane.points)[-1])))
         while stack and len(routes) < MAX_ROUTES:
             path, travelled = stack.pop()
             if travelled >= length_m:
@@ -107,6 +109,10 @@ def corridor(routes: Sequence[Array], world_seed: int, share: float = 0.5) -> li
     The first one is drawn with ``world_seed`` among those with plenty of company, the others
     follow in an order drawn with it.
     """
+    rng = generator("corridor", world_seed)
+    # Enough of them for a fleet; comparing each with each grows with the square.
+    chosen = rng.permutation(len(routes))[:MAX_COMPARED]
+    routes = [routes[i] for i in chosen]
     trees = [cKDTree(route[:, :2]) for route in routes]
     near = np.array(
         [
@@ -115,7 +121,6 @@ def corridor(routes: Sequence[Array], world_seed: int, share: float = 0.5) -> li
         ]
     )
     company = (near >= share).sum(axis=1)
-    rng = generator("corridor", world_seed)
     first = int(rng.choice(np.flatnonzero(company >= 0.6 * company.max())))
     others = [i for i in rng.permutation(len(routes)) if i != first and near[first, i] >= share]
     return [routes[first]] + [routes[i] for i in others]

@@ -61,8 +61,10 @@ def _vehicle(rng: np.random.Generator, travelled: Array, speed: float) -> _Vehic
     size = TRUCK if rng.random() < 0.15 else CAR
     kind = rng.integers(3)
     if kind == 0:
-        start, side = rng.uniform(-30, 40), rng.choice([-1.0, 1.0])
-        return _Vehicle(start, speed + rng.normal(0, 1.5), side * rng.uniform(3.2, 3.8), 0.0, size)
+        # Anywhere along the path: those that stay beside the ego all the way are few.
+        start, side = rng.uniform(-40, travelled[-1] + 40), rng.choice([-1.0, 1.0])
+        pace = speed * rng.uniform(0.6, 1.4)
+        return _Vehicle(start, pace, side * rng.uniform(3.2, 3.8), 0.0, size)
     if kind == 1:
         start = rng.uniform(0, 2 * travelled[-1] + 1.0)
         return _Vehicle(start, -max(speed, 3.0), rng.uniform(3.5, 7.0), np.pi, size)
