@@ -98,11 +98,10 @@ def _positions(line: Any, path: str | Path, name: str) -> Array:
     """(n, 3) from a list of positions, checked."""
     if not isinstance(line, list) or len(line) < 2:
         raise BadInput(path, f"{name}: a line needs two vertices or more")
-    try:
-        rows = [(float(p[0]), float(p[1]), float(p[2]) if len(p) > 2 else np.nan) for p in line]
-    except (TypeError, ValueError, IndexError, KeyError):
-        raise BadInput(path, f"{name}: a position is not [longitude, latitude]") from None
-    lonlat = np.array(rows)
+    if not all(isinstance(p, list) and len(p) > 1 and _numeric(p) for p in line):
+        raise BadInput(path, f"{name}: a position is not [longitude, latitude]")
+    rows = [(*p[:2], p[2] if len(p) > 2 else np.nan) for p in line]
+    lonlat = np.array(rows, dtype=np.float64)
     if not np.isfinite(lonlat[:, :2]).all():
         raise BadInput(path, f"{name}: a longitude or latitude is not finite")
     beyond = (np.abs(lonlat[:, 0]) > 180) | (np.abs(lonlat[:, 1]) > 90)
@@ -115,6 +114,10 @@ def _positions(line: Any, path: str | Path, name: str) -> Array:
         )
     lonlat[~np.isfinite(lonlat[:, 2]), 2] = np.nan
     return lonlat
+
+
+def _numeric(position: list[Any]) -> bool:
+    return all(isinstance(v, int | float) and not isinstance(v, bool) for v in position[:3])
 
 
 def _read_stdin() -> Any:
