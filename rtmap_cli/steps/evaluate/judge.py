@@ -212,8 +212,7 @@ def judge_scenes(predicted: str | Path, truth: str | Path) -> dict[str, Any]:
     truly, said = [np.zeros(0, bool)], [np.zeros(0, bool)]
     try:
         for scene, answer in zip(scenes, answers, strict=True):
-            xy = np.array([f["ego_xy"] for f in scene["frames"]], float).reshape(-1, 2)
-            events = [_event(e) for e in scene["events"]]
+            xy, events = scene_truth(scene)
             truly.append(changed_frames(xy, events))
             said.append(np.array([bool(f["predicted_changed"]) for f in answer["frames"]]))
     except (KeyError, TypeError, ValueError) as error:
@@ -232,6 +231,12 @@ def read_scenes(path: str | Path) -> list[dict[str, Any]]:
     if not all(isinstance(s, dict) and isinstance(s.get("frames"), list) for s in scenes):
         raise BadInput(path, "a scene has no frames")
     return scenes
+
+
+def scene_truth(scene: dict[str, Any]) -> tuple[Array, list[Array]]:
+    """Ego positions (n, 2) and outlines or lines of the change events of a scene, metres."""
+    xy = np.array([f["ego_xy"] for f in scene["frames"]], float).reshape(-1, 2)
+    return xy, [_event(e) for e in scene["events"]]
 
 
 def _event(event: dict[str, Any]) -> Array:
