@@ -6,7 +6,9 @@ the network's error, so that n frames are not n votes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,7 +34,8 @@ class Traversal:
     width in the ego frame. Of each element: ``frame`` (n,) row of its frame, ``class_name``,
     ``score``, ``points`` (n, V, 2) in the map frame and ``covariance`` (n, V, 2, 2) = R Σ Rᵀ of
     the network's own scales (the pose's part is kept apart: it is common to a frame).
-    ``asked``: prior elements that the network was asked about, see ``Questions``.
+    ``asked``: prior elements that the network was asked about, see ``Questions``. ``cut`` (n,):
+    reaches the border of the range; ``localized``: the poses come from localization.
     """
 
     run_id: str
@@ -48,6 +51,7 @@ class Traversal:
     covariance: Array
     cut: NDArray[np.bool_]
     asked: Questions
+    localized: bool = True
     model_sha256: str | None = None
 
     def __len__(self) -> int:
@@ -173,6 +177,7 @@ def traversal_of(run: Run, min_score: float = FOUND_SCORE) -> Traversal:
             o.existence[asked].astype(np.float64),
             o.prior_points[asked],
         ),
+        localized=run.poses is not None,
         model_sha256=run.info.get("model_sha256"),
     )
 
@@ -186,3 +191,54 @@ def pose_variance(traversal: Traversal, frame: Int, xy: Array, normal: Array) ->
     across = normal[:, 0] * -lever[:, 1] + normal[:, 1] * lever[:, 0]
     jacobian = np.column_stack([normal, across])
     return np.einsum("ni,nij,nj->n", jacobian, traversal.pose_covariance[frame], jacobian)
+
+
+def find_runs(folder: str | Path) -> list[Path]:
+    """The run folders of a folder: itself, or those directly in it, by name.
+
+    BadInput when there is no such folder or no run in it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise BadInput(folder, "no such folder")
+    if (folder / "run.json").exists():
+        return [folder]
+    runs = sorted(p.parent for p in folder.glob("*/run.json"))
+    if not runs:
+        raise BadInput(folder, "holds no runs", "give a run folder or a folder of run folders")
+    return runs
+
+
+def read_traversals(paths: Sequence[Path], crs: str | None = None) -> tuple[list[Traversal], str]:
+    """Runs as traversals in one CRS (that of the map, or of the first run), which is returned.
+
+    BadInput names the run that is broken, lies in another CRS, has no frame that can be used, or
+    is there twice.
+    """
+    from rtmap_cli.logs.run import read_run
+    from rtmap_cli.maps.crs import check_map_crs, check_same_crs
+
+    out: list[Traversal] = []
+    seen: dict[str, Path] = {}
+    for path in paths:
+        run = read_run(path)
+        if crs is None:
+            crs = check_map_crs(run.crs, path / "run.json")
+        check_same_crs(run.crs, crs, path / "run.json")
+        if run.log_id in seen:
+            raise BadInput(
+                path, f"is the run of {run.log_id}, as {seen[run.log_id]} is", "drop one"
+            )
+        seen[run.log_id] = path
+        traversal = traversal_of(run)
+        if not len(traversal.pose):
+            raise BadInput(path, "has no frame with a usable pose", "localize it again")
+        out.append(traversal)
+    return out, crs or ""
+
+
+def classes_of(paths: Sequence[Path]) -> list[str]:
+    """The classes that the models of the runs know, in the order in which they appear."""
+    from rtmap_cli.logs.run import read_run_info
+
+    return list(dict.fromkeys(str(c) for p in paths for c in read_run_info(p)["classes"]))

@@ -53,7 +53,9 @@ class Evidence:
     """One element and its stretches; elements found new have ``new`` set and no prior log-odds.
 
     ``votes`` (3, n) summed log-likelihoods per station (see ``maps.existence``), ``hits`` and
-    ``views`` (n,) summed over the drives, ``drives`` (n,) how many could see the station.
+    ``views`` (n,) summed over the drives, ``drives`` (n,) how many could see the station. Of prior
+    lines also ``places``, unit ``normals`` (n, 2) of the stations and the fused ``offset`` of the
+    detections to the left of the line with its sigma (m; NaN, inf where unseen).
     """
 
     element: Element
@@ -65,6 +67,10 @@ class Evidence:
     hits: Array
     views: Array
     drives: Array = field(default_factory=lambda: np.zeros(0))
+    places: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    normals: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    offset: Array = field(default_factory=lambda: np.zeros(0))
+    offset_sigma: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def in_view(self) -> bool:

@@ -19,11 +19,12 @@ from rtmap_cli.maps.existence import (
     runs_of,
     stretches,
 )
-from rtmap_cli.maps.stations import Stations, stations_of
+from rtmap_cli.maps.stations import Samples, Stations, stations_of
 from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, ring_counts
 from rtmap_cli.steps.detect_changes.lines import (
     all_line_counts,
     class_samples,
+    fused_offsets,
     new_lines,
     refit_lines,
 )
@@ -98,10 +99,32 @@ def _lines(
         # What is left of the candidates competes once more, without those that were refuted.
         found = _supported(found, len(old), stations, votes, policy)
     out = [_line_evidence(e, k, stations, votes, settings) for k, e in enumerate(prior)]
+    _add_offsets(out, stations, traversals, samples, fresh, settings)
     for k, line in enumerate(found):
         element = Element(new_id(name, line), name, line)
         out.append(_line_evidence(element, len(old) + k, stations, votes, settings, new=True))
     return out
+
+
+def _add_offsets(
+    prior: list[Evidence],
+    stations: Stations,
+    traversals: Sequence[Traversal],
+    samples: Sequence[Samples],
+    fresh: NDArray[np.bool_],
+    settings: Settings,
+) -> None:
+    """Where the fresh drives put the prior lines, relative to where the map has them."""
+    if not prior or not fresh.any():
+        return
+    chosen = np.flatnonzero(fresh)
+    offset, variance = fused_offsets(
+        stations, [traversals[k] for k in chosen], [samples[k] for k in chosen], settings.fusion
+    )
+    for k, e in enumerate(prior):
+        index = stations.of_line(k)
+        e.places, e.normals = stations.xy[index], stations.normal[index]
+        e.offset, e.offset_sigma = offset[index], np.sqrt(variance[index])
 
 
 def _supported(

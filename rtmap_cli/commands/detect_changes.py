@@ -1,0 +1,129 @@
+"""rtmap detect-changes: tell what is gone from the map and what is new."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rtmap_cli import options
+
+if TYPE_CHECKING:
+    from rtmap_cli.formats.changes import ChangeEvent
+
+
+@click.command("detect-changes")
+@click.argument("runs", metavar="RUN...", nargs=-1, required=True, type=options.PATH)
+@options.map_path
+@options.map_version
+@options.output("GeoJSON file to write; - for stdout.")
+@click.option(
+    "--min-probability",
+    type=click.FloatRange(0, 1),
+    default=0.5,
+    show_default=True,
+    help="Leave out less probable changes.",
+)
+@click.option("--fail-on-change", is_flag=True, help="Exit 1 when a change is found.")
+@click.option(
+    "--write-runs", is_flag=True, help="Also write RUN/changes.parquet: what each run says alone."
+)
+@options.overwrite
+@options.as_json
+def command(
+    runs: tuple[Path, ...],
+    map_path: Path,
+    map_version: int | None,
+    output: Path,
+    min_probability: float,
+    fail_on_change: bool,
+    write_runs: bool,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Tell which elements of the map are gone, displaced, or missing, from one or more RUNs.
+
+    Evidence is gathered per frame, put together per run (one vote), then over the runs: an element
+    that was in view and not hidden but not found speaks for a delete, detections that match
+    nothing for an insert. Parts of a line that are gone are told as parts. Runs are read with
+    their localized poses where they have some.
+
+    \b
+    Example:
+      rtmap detect-changes runs/monday runs/tuesday --map map -o changes.geojson
+    """
+    from rtmap_cli.errors import BadInput, Findings, NoAnswer, UsageError
+    from rtmap_cli.formats.changes import write_change_table, write_changes
+    from rtmap_cli.logs.traversal import classes_of, read_traversals
+    from rtmap_cli.maps.store import read_map
+    from rtmap_cli.output import emit, log
+    from rtmap_cli.steps.detect_changes.events import change_events
+    from rtmap_cli.steps.detect_changes.evidence import gather_evidence
+
+    stream = str(output) == "-"
+    if stream and as_json:
+        raise UsageError("--json and -o - both want stdout: choose one")
+    if not stream and output.exists() and not overwrite:
+        raise BadInput(output, "exists already", "choose another output or pass --overwrite")
+    prior = read_map(map_path, map_version)
+    traversals, _ = read_traversals(runs, prior.crs)
+    classes = classes_of(runs)
+    _tell_unlocalized([t.run_id for t in traversals if not t.localized])
+    evidence = gather_evidence(traversals, prior, classes)
+    if len(prior) and not any(e.in_view for e in evidence if not e.new):
+        raise NoAnswer(f"{map_path}: none of its elements is in view of any frame of these runs")
+    found = change_events(evidence, min_probability)
+    info = {
+        "map": str(map_path),
+        "map_version": prior.version,
+        "crs_of_map": prior.crs,
+        "runs": [t.run_id for t in traversals],
+        "min_probability": min_probability,
+    }
+    write_changes(found, prior.crs, output, info)
+    if write_runs:
+        for path, traversal in zip(runs, traversals, strict=True):
+            alone = change_events(gather_evidence([traversal], prior, classes), min_probability)
+            write_change_table(alone, path / "changes.parquet", prior.crs)
+    kilometres = sum(t.kilometres for t in traversals)
+    counts = {k: sum(c.kind == k for c in found) for k in ("delete", "insert", "modify")}
+    told = ", ".join(f"{n} {kind}" for kind, n in counts.items())
+    if not as_json:
+        log(f"{map_path}: {told} in {kilometres:.2f} km of {len(traversals)} runs")
+    if not stream:
+        result = info | {"output": str(output), "kilometres": kilometres, "counts": counts}
+        emit(result | {"changes": [c.properties() for c in found]}, as_json, _lines(found))
+    if fail_on_change and found:
+        raise Findings(f"{len(found)} changes found")
+
+
+def _tell_unlocalized(names: list[str]) -> None:
+    from rtmap_cli.output import log
+
+    if names:
+        log(
+            f"{len(names)} runs are not localized (first: {names[0]}): their initial poses are "
+            "used; run `rtmap localize` first for sharper results"
+        )
+
+
+def _lines(found: list[ChangeEvent]) -> list[str]:
+    from rtmap_cli.output import table
+
+    if not found:
+        return ["no changes"]
+    rows: list[list[Any]] = []
+    for c in found:
+        n = c.counts
+        rows.append(
+            [
+                c.kind,
+                c.class_name,
+                c.element_id or "-",
+                f"{c.probability:.3f}",
+                f"{n.traversals_seen}/{n.traversals_in_view}",
+                f"{n.frames_seen}/{n.frames_in_view}",
+            ]
+        )
+    return table(["change", "class", "element", "probability", "runs seen", "frames seen"], rows)

@@ -1,0 +1,94 @@
+"""From evidence to the changes that are told: inserts, deletes (also of stretches), modifies."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.formats.changes import ChangeEvent
+from rtmap_cli.geometry.polylines import length
+from rtmap_cli.maps.evidence import Evidence, Policy, Stretch
+from rtmap_cli.maps.existence import logit, probability, runs_of
+
+Array = NDArray[np.float64]
+
+DISPLACED = 0.3
+"""A line that lies farther (m) from its place in the map than this is modified …"""
+TOLD = 0.5
+"""… and told of when the displacement of a stretch is at least this (m) on average."""
+
+
+def change_events(
+    evidence: Sequence[Evidence], min_probability: float = 0.5, policy: Policy | None = None
+) -> list[ChangeEvent]:
+    """The changes of at least ``min_probability``, most probable first.
+
+    A delete is an element or a stretch of it that does not exist, an insert a new element, a
+    modify a stretch that exists but elsewhere.
+    """
+    policy = policy or Policy()
+    out: list[ChangeEvent] = []
+    for e in evidence:
+        for stretch in e.stretches:
+            if e.new:
+                out.append(_event("insert", e, stretch, stretch.log_odds))
+            elif not stretch.exists:
+                out.append(_event("delete", e, stretch, -stretch.log_odds))
+        if not e.new:
+            out += _modified(e, policy)
+    out = [c for c in out if c.probability >= min_probability]
+    return sorted(out, key=lambda c: (-c.probability, c.change_id))
+
+
+def _event(
+    kind: str, evidence: Evidence, stretch: Stretch, log_odds: float, points: Array | None = None
+) -> ChangeEvent:
+    element = evidence.element
+    geometry = stretch.geometry if points is None else points
+    return ChangeEvent(
+        change_id=_change_id(kind, element.element_id, geometry),
+        kind=kind,
+        class_name=element.class_name,
+        element_id=None if evidence.new else element.element_id,
+        points=geometry,
+        probability=float(probability(log_odds)),
+        log_odds=float(log_odds),
+        counts=stretch.counts,
+    )
+
+
+def _change_id(kind: str, element_id: str, geometry: Array) -> str:
+    """The same change of the same place gets the same id in every run of the command."""
+    place = np.round(geometry[:, :2].mean(axis=0)).astype(int)
+    text = f"{kind} {element_id} {place[0]} {place[1]}"
+    return f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
+
+
+def _modified(evidence: Evidence, policy: Policy) -> list[ChangeEvent]:
+    """Stretches whose detections agree on another place, across the line.
+
+    The probability that the line lies more than ``DISPLACED`` from its place in the map, from the
+    fused offset and its variance (Gaussian).
+    """
+    from scipy.special import ndtr
+
+    offset, sigma = evidence.offset, evidence.offset_sigma
+    if not len(offset):
+        return []
+    moved = np.isfinite(offset) & (np.abs(np.nan_to_num(offset)) >= TOLD)
+    moved &= np.abs(np.nan_to_num(offset)) >= 3 * sigma
+    out = []
+    for run in runs_of(moved):
+        points = evidence.places[run] + offset[run, None] * evidence.normals[run]
+        if len(run) < 2 or length(points) < policy.shortest_m:
+            continue
+        if np.ptp(np.sign(offset[run])) > 0:
+            continue
+        z = (np.abs(offset[run]) - DISPLACED) / sigma[run]
+        p = float(ndtr(np.median(z)))
+        stretch = Stretch(True, 0.0, 0.0, points, evidence.counts, int(run[0]), int(run[-1]))
+        out.append(_event("modify", evidence, stretch, float(logit(p)), points))
+    return out
