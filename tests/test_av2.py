@@ -5,17 +5,22 @@ from __future__ import annotations
 import copy
 import gzip
 import json
+from collections import Counter
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import shapely
+from hypothesis import given
+from hypothesis import strategies as st
 from sample_logs import av2_archive, rewrite, truncate, write_archive, write_av2_log
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.formats.av2 import Av2Log, read_av2_map, thin
+from rtmap_cli.formats.av2_elements import dividers
 from rtmap_cli.formats.av2_map import read_av2_archive, vector_map_of
 from rtmap_cli.geometry.polylines import length, resample
 from rtmap_cli.geometry.poses import se3_from_xyyaw, xyyaw_of
@@ -277,6 +282,45 @@ def test_crossing_whose_edges_run_against_each_other(tmp_path: Path) -> None:
     vector_map, notes = converted(tmp_path / "log", archive)
     assert shapely.Polygon(vector_map.by_id()["crossing-7"].xy).area == pytest.approx(24)
     assert notes["crossings with crossed edges set right"] == 1
+
+
+def test_crossings_that_are_no_quadrilaterals(tmp_path: Path) -> None:
+    archive = av2_archive()
+
+    def edge(*points: tuple[float, float]) -> list[dict[str, float]]:
+        return [{"x": x, "y": y, "z": 20.0} for x, y in points]
+
+    archive["pedestrian_crossings"] |= {
+        "8": {"edge1": edge((0, 0), (1, 0)), "edge2": edge((2, 0), (3, 0))},
+        "9": {"edge1": edge((0, 0), (9, 9), (0, 9)), "edge2": edge((9, 0), (4, 3), (5, 9))},
+        "10": {"edge1": edge((0, 0)), "edge2": edge((2, 0), (3, 0))},
+    }
+    vector_map, notes = converted(tmp_path / "log", archive)
+    rings = vector_map.of_class("ped_crossing")
+    assert [e.element_id for e in rings] == ["crossing-7", "crossing-9"]
+    assert all(shapely.Polygon(e.xy).is_valid for e in rings)
+    assert notes["crossings without area left out"] == 1
+    assert notes["crossings without two edges left out"] == 1
+
+
+@given(
+    cuts=st.sets(st.integers(1, 99), max_size=8),
+    copies=st.lists(st.tuples(st.integers(0, 8), st.booleans()), max_size=6),
+    seed=st.integers(0, 1000),
+)
+def test_a_line_in_any_pieces_becomes_one(
+    cuts: set[int], copies: list[tuple[int, bool]], seed: int
+) -> None:
+    s = np.arange(101.0)
+    line = np.column_stack([s, 5 * np.sin(s / 15), 0.1 * s])
+    ends = [0, *sorted(cuts), 100]
+    pieces = [line[a : b + 1] for a, b in pairwise(ends)]
+    pieces += [pieces[k % len(pieces)][:: -1 if back else 1] for k, back in copies]
+    order = np.random.default_rng(seed).permutation(len(pieces))
+    named = [(f"{i}-left", "SOLID_WHITE", pieces[k]) for i, k in enumerate(order)]
+    (element,) = dividers(named, Counter())
+    points = element.points if element.points[0, 0] == 0 else element.points[::-1]
+    np.testing.assert_array_equal(points, line)
 
 
 def test_unknown_heights_come_from_the_raster_or_stay_unknown(tmp_path: Path) -> None:

@@ -160,6 +160,7 @@ def test_other_column_types_are_said(log_folder: Path) -> None:
         ({"schema_version": "2.0"}, "version 2.0 is unknown"),
         ({"ground_z": None}, "ground_z is not a number"),
         ({"crs": ...}, "crs is missing"),
+        ({"crs": "EPSG:4326"}, "is geographic"),
     ],
 )
 def test_bad_log_json(log_folder: Path, change: dict, why: str) -> None:

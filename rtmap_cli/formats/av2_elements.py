@@ -23,6 +23,8 @@ SAME_LINE = 0.05
 """Lines nearer than this (m) are one painted line: half the width of a narrow one."""
 MIN_OVERLAP = 2.0
 """Lines that run together for less (m) part at a fork and are left as they are."""
+MIN_AREA = 0.1
+"""m² below which a crossing is none."""
 MEET = 0.01
 """Ends within this distance (m) meet: AV2 rounds coordinates to it."""
 
@@ -47,11 +49,9 @@ def crossings(edges: Mapping[int, tuple[Array, Array]], notes: Counter[str]) -> 
         if not shapely.Polygon(ring[:, :2]).is_valid:
             ring = np.concatenate([first, second])
             notes["crossings with crossed edges set right"] += 1
-        polygon = shapely.Polygon(ring[:, :2])
-        if not polygon.is_valid:
-            corners = shapely.MultiPoint(ring[:, :2]).convex_hull
-            ring = _heights_of(np.asarray(corners.boundary.coords)[:-1, :2], ring)
-        if shapely.Polygon(ring[:, :2]).area < 0.1:
+        if not shapely.Polygon(ring[:, :2]).is_valid:
+            ring = _hull(ring)
+        if shapely.Polygon(ring[:, :2]).area < MIN_AREA:
             notes["crossings without area left out"] += 1
             continue
         closed = np.concatenate([ring, ring[:1]])
@@ -110,7 +110,8 @@ def boundaries(areas: Mapping[int, Array], notes: Counter[str]) -> list[Element]
         polygon = shapely.Polygon(ring[:, :2])
         if not polygon.is_valid:
             notes["drivable areas that cross themselves set right"] += 1
-            polygon = polygon.buffer(0)
+            parts = shapely.get_parts(shapely.make_valid(polygon))
+            polygon = shapely.unary_union([p for p in parts if p.geom_type == "Polygon"])
         polygons.append((area_id, polygon))
         sources.append(np.concatenate([ring, ring[:1]]))
     if not polygons:
@@ -263,10 +264,13 @@ def _from_lowest(ring: Array) -> Array:
     return np.concatenate([turned, turned[:1]])
 
 
-def _heights_of(xy: Array, source: Array) -> Array:
-    """(n, 2) points with the heights of the nearest of (k, 3) points."""
-    _, nearest = cKDTree(source[:, :2]).query(xy)
-    return np.column_stack([xy, source[nearest, 2]])
+def _hull(points: Array) -> Array:
+    """Those of the (n, 3) points that lie on their convex hull, in order around it."""
+    hull = shapely.MultiPoint(points[:, :2]).convex_hull
+    if hull.geom_type != "Polygon":
+        return points[:3]  # All on one line: no area whichever are taken.
+    corners = np.asarray(hull.exterior.coords)[:-1, :2]
+    return points[cKDTree(points[:, :2]).query(corners)[1]]
 
 
 def _boundary_heights(ring: Array, sources: list[Array]) -> Array:
