@@ -1,0 +1,255 @@
+"""The ground as raster tiles of layers, anchored to the map frame and cached in the world.
+
+A tile of level l covers (256 · resolution)² metres, resolution = base · 2^l, rows along +y. Its
+eight uint8 channels are the shares of sidewalk, curb, asphalt, white and yellow paint (worn), the
+asphalt's and the verge's texture, and old patches of asphalt: everything that a drive's
+colours are mixed from, linearly. Tiles do not depend on the style of a drive.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from rtmap_cli.steps.simulate.world import World
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+TILE = 256
+LEVELS = 4
+NOISE_SIZE = 1024
+SUBPIXEL = 4
+"""Fractional bits of the drawing coordinates."""
+
+
+def opencv() -> Any:
+    """The cv2 module on one thread; a clear error when the extra is not installed."""
+    try:
+        import cv2
+    except ImportError:
+        from rtmap_cli.errors import UsageError
+
+        raise UsageError(
+            "rendering needs OpenCV: pip install 'rtmap[simulate]' (opencv-python-headless)"
+        ) from None
+    cv2.setNumThreads(1)
+    return cv2
+
+
+@cache
+def noise_fields() -> NDArray[np.float32]:
+    """(4, 1024, 1024) periodic unit-variance noise of correlation 1, 5, 24 and 80 pixels."""
+    rng = np.random.default_rng(7)
+    out = np.empty((4, NOISE_SIZE, NOISE_SIZE), np.float32)
+    f = np.fft.fftfreq(NOISE_SIZE)
+    square = f[:, None] ** 2 + f[None, : NOISE_SIZE // 2 + 1] ** 2
+    for k, sigma in enumerate((0.7, 3.5, 16.0, 55.0)):
+        white = np.fft.rfft2(rng.standard_normal((NOISE_SIZE, NOISE_SIZE)))
+        smooth = np.fft.irfft2(white * np.exp(-2 * (np.pi * sigma) ** 2 * square))
+        out[k] = smooth / smooth.std()
+    return out
+
+
+def _noise(field: int, x0: float, y0: float, step: float, unit: float) -> NDArray[np.float32]:
+    """A tile of noise whose pixels are ``unit`` metres, sampled every ``step`` metres."""
+    k = np.arange(TILE)
+    cols = np.floor((x0 + k * step) / unit).astype(np.int64) % NOISE_SIZE
+    rows = np.floor((y0 + k * step) / unit).astype(np.int64) % NOISE_SIZE
+    return noise_fields()[field][np.ix_(rows, cols)]
+
+
+def _layout(world: World) -> dict[str, Any]:
+    """Spatial indices of what is drawn on the ground; computed once per world."""
+    if "curb" in world.boxes:
+        return world.boxes
+    rng = np.random.default_rng([world.seed, 53])
+    layout: dict[str, Any] = world.boxes
+    layout["sidewalk_width"] = float(rng.uniform(1.4, 3.2)) if rng.random() < 0.75 else 0.0
+    layout["curb_width"] = float(rng.uniform(0.14, 0.32))
+    layout["wear"] = float(rng.uniform(0.0, 0.5))
+    layout["patches"] = float(rng.uniform(0.0, 1.0))
+    layout["offset"] = rng.uniform(0, 100, 2)
+    layout["paint"] = _boxes([p.polygon for p in world.paint])
+    layout["soft"] = _boxes(world.soft)
+    layout["curb"] = _boxes(world.curbs)
+    return layout
+
+
+def _boxes(shapes: list[Array]) -> Array:
+    """(n, 4) bounding boxes."""
+    return np.array([(*s.min(axis=0), *s.max(axis=0)) for s in shapes]).reshape(-1, 4)
+
+
+def _touching(boxes: Array, x0: float, y0: float, x1: float, y1: float) -> NDArray[np.int64]:
+    hit = (boxes[:, 0] <= x1) & (boxes[:, 2] >= x0) & (boxes[:, 1] <= y1) & (boxes[:, 3] >= y0)
+    return np.flatnonzero(hit)
+
+
+def ground_window(
+    world: World, x: float, y: float, half: float, level: int, base: float
+) -> tuple[Image, Image, Array]:
+    """Layers of the square of ``half`` metres around (x, y) in the map frame.
+
+    Returns two (h, w, 4) images and the map coordinates (2,) of the centre of pixel (0, 0).
+    """
+    step = base * 2**level
+    side = TILE * step
+    i0, i1 = int(np.floor((x - half) / step)), int(np.ceil((x + half) / step))
+    j0, j1 = int(np.floor((y - half) / step)), int(np.ceil((y + half) / step))
+    out = np.empty((2, j1 - j0, i1 - i0, 4), np.uint8)
+    for tj in range(j0 // TILE, (j1 - 1) // TILE + 1):
+        for ti in range(i0 // TILE, (i1 - 1) // TILE + 1):
+            key = (step, ti, tj)
+            tile = world.tiles.get(key)
+            if tile is None:
+                tile = world.tiles[key] = draw_tile(world, ti * side, tj * side, step, level)
+            a0, a1 = max(i0, ti * TILE), min(i1, (ti + 1) * TILE)
+            b0, b1 = max(j0, tj * TILE), min(j1, (tj + 1) * TILE)
+            out[:, b0 - j0 : b1 - j0, a0 - i0 : a1 - i0] = tile[
+                :, b0 - tj * TILE : b1 - tj * TILE, a0 - ti * TILE : a1 - ti * TILE
+            ]
+    return out[0], out[1], np.array([(i0 + 0.5) * step, (j0 + 0.5) * step])
+
+
+def draw_tile(world: World, x0: float, y0: float, step: float, level: int) -> Image:
+    """One tile (2, 256, 256, 4) with its lower left corner at (x0, y0) in the map frame."""
+    cv2 = opencv()
+    layout = _layout(world)
+    fine = 1 if level == 0 else 2
+    size, scale = TILE * fine, fine / step
+    side = TILE * step
+    margin = 4.0
+
+    def pixels(points: Array) -> NDArray[np.int32]:
+        p = ((points - (x0, y0)) * scale - 0.5) * (1 << SUBPIXEL)
+        return np.round(p).astype(np.int32)
+
+    def fill(polygons: list[NDArray[np.int32]], even_odd: bool) -> Image:
+        mask = np.zeros((size, size), np.uint8)
+        if even_odd and polygons:
+            cv2.fillPoly(mask, polygons, 255, cv2.LINE_AA, SUBPIXEL)
+        else:
+            for polygon in polygons:
+                cv2.fillPoly(mask, [polygon], 255, cv2.LINE_AA, SUBPIXEL)
+        return mask
+
+    window = shapely.box(x0 - margin, y0 - margin, x0 + side + margin, y0 + side + margin)
+    area = shapely.intersection(world.surface, window)
+    asphalt = fill([pixels(r) for r in _rings_of(area)], True)
+    outer = asphalt
+    if layout["sidewalk_width"] and not area.is_empty:
+        wide = shapely.buffer(area, layout["sidewalk_width"], quad_segs=2)
+        outer = fill([pixels(r) for r in _rings_of(wide)], True)
+    curb = _draw_curbs(cv2, world, layout, (x0, y0, side), pixels, size, scale)
+    white, yellow = _draw_paint(cv2, world, layout, (x0, y0, side), pixels, size)
+    soft = _touching(layout["soft"], x0 - 12, y0 - 12, x0 + side + 12, y0 + side + 12)
+    if len(soft):
+        asphalt, outer = _soften(cv2, world, soft, asphalt, outer, pixels, scale)
+    layers = [asphalt, outer, curb, white, yellow]
+    if fine > 1:
+        layers = [cv2.resize(m, (TILE, TILE), interpolation=cv2.INTER_AREA) for m in layers]
+    return _mix(layout, x0, y0, step, *(m.astype(np.float32) / 255 for m in layers))
+
+
+def _rings_of(area: Any) -> list[Array]:
+    return [
+        np.asarray(ring.coords)
+        for part in shapely.get_parts(area)
+        if part.geom_type == "Polygon" and not part.is_empty
+        for ring in (part.exterior, *part.interiors)
+    ]
+
+
+def _draw_curbs(
+    cv2: Any, world: World, layout: dict[str, Any], box: tuple[float, float, float],
+    pixels: Any, size: int, scale: float,
+) -> Image:  # fmt: skip
+    """Curbs as thin strips along the boundaries."""
+    x0, y0, side = box
+    mask = np.zeros((size, size), np.uint8)
+    width = layout["curb_width"]
+    window = (x0 - 2, y0 - 2, x0 + side + 2, y0 + side + 2)
+    for k in _touching(layout["curb"], *window):
+        line = shapely.clip_by_rect(shapely.linestrings(world.curbs[k]), *window)
+        if line.is_empty:
+            continue
+        strip = shapely.buffer(line, width / 2, cap_style="flat", join_style="mitre")
+        rings = [pixels(r) for r in _rings_of(strip)]
+        if rings:
+            cv2.fillPoly(mask, rings, 255, cv2.LINE_AA, SUBPIXEL)
+    return mask
+
+
+def _draw_paint(
+    cv2: Any, world: World, layout: dict[str, Any], box: tuple[float, float, float],
+    pixels: Any, size: int,
+) -> tuple[Image, Image]:  # fmt: skip
+    x0, y0, side = box
+    masks = {"white": np.zeros((size, size), np.uint8), "yellow": np.zeros((size, size), np.uint8)}
+    for k in _touching(layout["paint"], x0, y0, x0 + side, y0 + side):
+        paint = world.paint[k]
+        cv2.fillPoly(masks[paint.colour], [pixels(paint.polygon)], 255, cv2.LINE_AA, SUBPIXEL)
+    return masks["white"], masks["yellow"]
+
+
+def _soften(
+    cv2: Any, world: World, soft: NDArray[np.int64], asphalt: Image, outer: Image,
+    pixels: Any, scale: float,
+) -> tuple[Image, Image]:  # fmt: skip
+    """Where a curb is gone the ground beside it is paved: asphalt fades out over 6 to 12 m."""
+    near = np.zeros_like(asphalt)
+    thick = max(1, round(9.0 * 2 * scale))
+    for k in soft:
+        cv2.polylines(near, [pixels(world.soft[k])], False, 255, thick, cv2.LINE_8, SUBPIXEL)
+    sigma = max(0.6, 2.5 * scale)
+    near = cv2.GaussianBlur(near, (0, 0), sigma)
+    return np.maximum(asphalt, near), np.maximum(outer, near)
+
+
+def _mix(
+    layout: dict[str, Any],
+    x0: float,
+    y0: float,
+    step: float,
+    asphalt: NDArray[np.float32],
+    outer: NDArray[np.float32],
+    curb: NDArray[np.float32],
+    white: NDArray[np.float32],
+    yellow: NDArray[np.float32],
+) -> Image:
+    """Shares of the materials (they add up to at most one) and texture, as uint8 layers."""
+    ox, oy = layout["offset"]
+
+    def noise(field: int, unit: float) -> NDArray[np.float32]:
+        return _noise(field, x0 + ox * 10, y0 + oy * 10, step, unit)
+
+    fine, middle, coarse, broad = (
+        noise(0, 0.07),
+        noise(1, 0.125),
+        noise(2, 0.125),
+        noise(3, 0.25),
+    )
+    wear = 1.05 - layout["wear"] * (0.6 + 0.5 * broad) - 0.1 * np.abs(middle) - 0.08 * fine
+    wear = np.clip(wear, 0.12, 1.0)
+    white, yellow = white * wear, yellow * wear
+    white = np.minimum(white, 1 - yellow)
+    left = 1 - white - yellow
+    curb = curb * left
+    left -= curb
+    road = asphalt * left
+    side = np.clip(outer - asphalt, 0, 1) * left
+    texture = np.clip(0.5 + 0.09 * fine + 0.05 * middle + 0.07 * coarse + 0.05 * broad, 0, 1)
+    patch = np.clip((broad * 0.6 + coarse * 0.8 - 1.6 + layout["patches"]) * 4, 0, 1)
+    verge = np.clip(0.5 + 0.06 * fine + 0.09 * middle + 0.12 * coarse, 0, 1)
+    out = np.empty((2, TILE, TILE, 4), np.float32)
+    for k, layer in enumerate((side, curb, road, white)):
+        out[0, ..., k] = layer
+    for k, layer in enumerate((yellow, road * texture, (1 - road) * verge, road * patch)):
+        out[1, ..., k] = layer
+    return (out * 255 + 0.5).astype(np.uint8)
