@@ -11,6 +11,8 @@ real; drives and observations are simulated. Prints one JSON object per line.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import os
 import sys
@@ -21,11 +23,18 @@ from typing import Any
 
 import numpy as np
 
+from rtmap_cli.cli import run as rtmap
 from rtmap_cli.formats.av2_map import read_av2_archive, vector_map_of
-from rtmap_cli.logs.run import OUTDATED, Run
+from rtmap_cli.logs.run import OUTDATED, Run, read_run
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import CLASSES
-from rtmap_cli.steps.evaluate.precision import Scorer
+from rtmap_cli.maps.store import read_map, write_new_map
+from rtmap_cli.steps.evaluate.compare import Settings, compare
+from rtmap_cli.steps.evaluate.drives import read_drives
+from rtmap_cli.steps.evaluate.judge import judge_poses
+from rtmap_cli.steps.evaluate.poses import pool_poses
+from rtmap_cli.steps.evaluate.precision import MapScore, Scorer
+from rtmap_cli.steps.simulate.degrade import degrade_map
 from rtmap_cli.steps.simulate.drives import drive_over_route, with_traffic
 from rtmap_cli.steps.simulate.observations import observe
 from rtmap_cli.steps.simulate.perception import DriveKey
@@ -145,23 +154,78 @@ def report(**values: Any) -> None:
 
 
 def chain(maps: list[Place], options: argparse.Namespace) -> None:
-    """Run the chain of commands on every map and kind; a folder keeps what it wrote."""
-    from chain_commands import run_chain
-
+    """Three drives per map and kind: localize, crowdsource drive by drive, evaluate."""
     for kind in options.kinds:
         rows = []
         for place in maps:
             with tempfile.TemporaryDirectory() as folder:
                 work = Path(options.keep or folder) / place.name / kind
-                rows.append(run_chain(place.folder, kind, work, options.seed, report))
+                rows.append(chain_of(place, kind, work, options))
+            report(map=place.name, kind=kind, **rows[-1])
         report(kind=kind, mean_over_maps=mean_of(rows))
+
+
+def chain_of(place: Place, kind: str, work: Path, options: argparse.Namespace) -> dict[str, Any]:
+    """Pose errors before and after localize, and AP over the cycles, on one map."""
+    command("import", "av2", place.folder, "-o", work / "world")
+    world = read_map(work / "world")
+    prior = degrade_map(world, options.prior_sigma, options.seed)
+    write_new_map(prior, work / "prior", f"the world with an error of {options.prior_sigma} m")
+    runs, drives, poses, single = work / "runs", [], {}, Scorer(CLASSES)
+    fused = work / "map"
+    maps: dict[str, Any] = {}
+    for number in range(options.cycles):
+        run = runs / f"{number:02d}"
+        asked = ("--prior", work / "prior") if options.prior_queries else ()
+        command(
+            "simulate", "observations", "--map", work / "world", "--log", f"av2:{place.folder}",
+            "--route", kind, "--preset", f"rtmap-{kind}", "--seed", options.seed,
+            "--traversal", number, "-o", run, *asked,
+        )  # fmt: skip
+        truth = runs / f"{number:02d}.truth.parquet"
+        drives += read_drives(truth)
+        add_frames(single, read_run(run), drives[-1].pose, place.index)
+        for name, flags in (("initial", None), ("single", ()), ("smooth", ("--smooth",))):
+            if flags is not None:
+                command("localize", run, "--map", work / "prior", *flags)
+            found = judge_poses(read_run(run), str(truth), initial=flags is None)
+            poses.setdefault(name, []).append(found)
+        command("crowdsource", runs, "--map", fused)
+        score = compare(read_map(fused), place.world, drives, Settings())
+        maps[f"cycle_{number + 1}"] = percent(score)
+    errors = {name: pose_errors(pool_poses(parts).as_json()) for name, parts in poses.items()}
+    return {"poses": errors, "ap": {"single_frame": percent(single.result())} | maps}
+
+
+def command(*arguments: object) -> None:
+    """Run one rtmap command quietly; what it says on failure ends the benchmark."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        code = rtmap([str(a) for a in arguments])
+    if code not in (0, 4):
+        sys.exit(f"rtmap {' '.join(map(str, arguments))}: exit {code}\n{said.getvalue()}")
+
+
+def percent(score: MapScore) -> dict[str, float]:
+    """AP by class and mAP in %."""
+    values = {name: c.mean for name, c in score.classes.items()} | {"mAP": score.mAP}
+    return {name: round(100 * v, 1) for name, v in values.items()}
+
+
+def pose_errors(result: dict[str, Any]) -> dict[str, float]:
+    """Mean and 90th percentile errors over all frames, and how honest their covariances are."""
+    names, frames = ("lateral_m", "longitudinal_m", "yaw_deg"), result["all_frames"]
+    out = {f"{k}_{what}": round(frames[k][what], 3) for k in names for what in ("mean", "p90")}
+    out["answered"] = result["share_answered"]
+    inside = (result.get("consistency") or {}).get("inside", {})
+    return out | {f"in_{k}": round(v["all"], 3) for k, v in inside.items()}
 
 
 def mean_of(rows: list[Any]) -> Any:
     """Mean of equally built nested dicts of numbers."""
     if isinstance(rows[0], dict):
         return {k: mean_of([r[k] for r in rows]) for k in rows[0]}
-    return round(float(np.mean(rows)), 4)
+    return round(float(np.mean(rows)), 3)
 
 
 def main() -> None:
@@ -175,6 +239,9 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=3, help="worlds (and corridors) per map")
     parser.add_argument("--drives", type=int, default=4, help="drives per world")
     parser.add_argument("--seed", type=int, default=1, help="seed of the chain")
+    parser.add_argument("--cycles", type=int, default=3, help="drives of the chain, one a cycle")
+    parser.add_argument("--prior-sigma", type=float, default=0.1, help="error of the prior (m)")
+    parser.add_argument("--prior-queries", action="store_true", help="simulate with the prior")
     parser.add_argument("--keep", help="folder for the files of the chain (default: none kept)")
     options = parser.parse_args()
     if options.data is None:

@@ -51,7 +51,7 @@ class Preset:
     ``noise`` scales the position errors and cut ends of a class; 0 switches them off.
     """
 
-    noise: ByClass = field(default_factory=lambda: _by_class(2.55, 1.16, 0.98))
+    noise: ByClass = field(default_factory=lambda: _by_class(2.737, 1.167, 0.784))
     vertex_scale: float = 0.10  # Laplace scale of each vertex
     offset_sd: float = 0.28  # sd of what the vertices of an element share
     # Shares of the offset's variance: fixed to the place, to the drive and place, to the element.

@@ -86,8 +86,7 @@ def find_routes(lanes: Sequence[Lane], kind: str, length_m: float) -> list[Array
             if travelled >= length_m:
                 line = np.concatenate([by_id[i].points for i in path])
                 line = smoothed(_without_repeats(line))
-                at = arc_length(line)
-                line = resample(line[at <= length_m + 1.0], int(length_m) + 1)
+                line = _at_steps(line, length_m)
                 if matches(kind, line):
                     routes.append(line)
                 continue
@@ -96,6 +95,12 @@ def find_routes(lanes: Sequence[Lane], kind: str, length_m: float) -> list[Array
                     more = float(arc_length(by_id[after].points)[-1])
                     stack.append(((*path, after), travelled + more))
     return routes
+
+
+def _at_steps(line: Array, length_m: float) -> Array:
+    """The first ``length_m`` metres of a line at 1 m steps."""
+    s, at = arc_length(line), np.arange(int(length_m) + 1.0)
+    return np.stack([np.interp(at, s, line[:, k]) for k in range(line.shape[1])], axis=-1)
 
 
 def _without_repeats(line: Array) -> Array:
