@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_logs import av2_archive, rewrite, truncate, write_archive, write_av2_log
 
@@ -303,6 +303,7 @@ def test_crossings_that_are_no_quadrilaterals(tmp_path: Path) -> None:
     assert notes["crossings without two edges left out"] == 1
 
 
+@settings(deadline=None, max_examples=40)
 @given(
     cuts=st.sets(st.integers(1, 99), max_size=8),
     copies=st.lists(st.tuples(st.integers(0, 8), st.booleans()), max_size=6),
