@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 
 from rtmap_cli.errors import BadInput, NoAnswer, UsageError
-from rtmap_cli.geometry.chamfer import chamfer, chamfer_pairs
+from rtmap_cli.geometry.chamfer import bands, beside, chamfer, chamfer_pairs, sample_lines
+from rtmap_cli.geometry.polylines import resample
 from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.logs.run import (
     MATCHED,
@@ -131,6 +133,33 @@ def test_chamfer_against_the_definition() -> None:
     assert chamfer(line(0, 10, 0.0), line(0, 10, 0.5)) == 0.5
 
 
+def wiggly(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Smooth random lines near each other, sampled."""
+    turn = np.cumsum(rng.normal(0, 0.25, (n, 30)), axis=1) + rng.uniform(-3, 3, (n, 1))
+    step = np.stack([np.cos(turn), np.sin(turn)], axis=-1) * rng.uniform(0.05, 1.0, (n, 1, 1))
+    lines = np.cumsum(step, axis=1) + rng.normal(0, 3, (n, 1, 2))
+    return sample_lines(list(lines), 100)
+
+
+def test_lines_beside_each_other_have_bands_that_touch() -> None:
+    rng = np.random.default_rng(2)
+    a, b = wiggly(rng, 40), wiggly(rng, 40)
+    i, j = (k.ravel() for k in np.indices((40, 40)))
+    near = beside(a, b, i, j, 1.9)
+    touch = shapely.intersects(bands(a, 2.0)[i], bands(b, 2.0)[j])
+    assert touch[near].all() and near.sum() > 300
+
+
+def test_sampling_all_lines_at_once() -> None:
+    rng = np.random.default_rng(4)
+    lines = [rng.normal(0, 20, (k, 2)) for k in (2, 5, 2, 40)]
+    lines += [np.array([[1.0, 2.0], [1.0, 2.0]]), np.repeat(lines[1], 2, axis=0)]
+    for count in (2, 100):
+        want = np.stack([resample(line, count) for line in lines])
+        np.testing.assert_allclose(sample_lines(lines, count), want, atol=1e-12)
+    assert sample_lines([], 7).shape == (0, 7, 2)
+
+
 def test_average_precision_by_hand() -> None:
     hits = np.array([True, False, True])
     assert average_precision(hits, 2) == pytest.approx(0.5 + 0.5 * 2 / 3)
@@ -208,7 +237,6 @@ def drive(step: float = 5.0, n: int = 10) -> Drive:
 
 def seen(vector_map: VectorMap, along: Drive, shift: float = 0.0) -> Run:
     """A run that sees the map's crop as it is, shifted sideways."""
-    from rtmap_cli.geometry.polylines import resample
     from rtmap_cli.maps.crop import MapIndex
 
     index, n = MapIndex(vector_map, join=True), len(along)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,40 @@ def chamfer(a: Array, b: Array) -> float:
     squares = cdist(a, b, "sqeuclidean")
     to_b, to_a = np.sqrt(squares.min(axis=1)), np.sqrt(squares.min(axis=0))
     return float(to_b.mean() + to_a.mean()) / 2
+
+
+def sample_lines(lines: Sequence[Array], count: int) -> Array:
+    """(n, count, 2) points at equal arc length of n polylines (any number of vertices ≥ 2 each).
+
+    Like ``polylines.resample`` line by line, in one pass over all of them.
+    """
+    if not len(lines):
+        return np.zeros((0, count, 2))
+    points = np.concatenate([line[:, :2] for line in lines]).astype(np.float64)
+    last = np.cumsum([len(line) for line in lines]) - 1
+    first = np.concatenate([[0], last[:-1] + 1])
+    way = np.diff(points, axis=0, append=points[-1:])
+    step = np.hypot(way[:, 0], way[:, 1])
+    step[last] = 0.0
+    # Each line's own arc length; sums over all lines only serve to find the segment.
+    s = np.concatenate(
+        [np.cumsum(np.concatenate([[0.0], step[a:b]])) for a, b in _ranges(first, last)]
+    )
+    total = s[last]
+    at = np.linspace(0.0, total, count, axis=1)
+    line_of = np.repeat(np.arange(len(lines)), last - first + 1)
+    offset = np.concatenate([[0.0], np.cumsum(total + 1.0)[:-1]])
+    k = np.searchsorted(s + offset[line_of], at + offset[:, None], side="right") - 1
+    k = np.clip(k, first[:, None], np.maximum(last - 1, first)[:, None])
+    share = np.clip((at - s[k]) / np.where(step[k] > 0, step[k], 1.0), 0.0, 1.0)
+    out: Array = points[k] + share[..., None] * way[k]
+    out[:, -1] = points[last]
+    out[total <= 0] = points[first[total <= 0]][:, None]
+    return out
+
+
+def _ranges(first: Index, last: Index) -> list[tuple[int, int]]:
+    return list(zip(first.tolist(), last.tolist(), strict=True))
 
 
 def chamfer_pairs(a: Array, b: Array, i: Index, j: Index, limit: float = np.inf) -> Array:
@@ -59,6 +94,32 @@ def _lower_bound(a: Array, b: Array, i: Index, j: Index, limit: float) -> Array:
 def _box_distance(points: Array, low: Array, high: Array) -> Array:
     gap = np.maximum(np.maximum(low[:, None] - points, points - high[:, None]), 0)
     return np.hypot(gap[..., 0], gap[..., 1])
+
+
+def beside(a: Array, b: Array, i: Index, j: Index, within: float, probes: int = 12) -> Any:
+    """(k,) True where some point of line a[i] surely lies beside line b[j], within a distance.
+
+    Some of a's points are probed: one that has its foot inside a segment of b lies in b's flat
+    band. False says nothing: a point not probed may. ``a`` (n, s, 2) and ``b`` (m, s, 2).
+    """
+    out = np.zeros(len(i), dtype=bool)
+    picks = np.linspace(0, a.shape[1] - 1, probes).round().astype(int)
+    for part in np.array_split(np.arange(len(i)), max(1, len(i) // 1024)):
+        p, q = a[i[part]][:, picks], b[j[part]]
+        gap = p[:, :, None] - q[:, None]
+        near = (gap**2).sum(axis=-1).argmin(axis=-1)
+        near = np.clip(near, 0, q.shape[1] - 2)
+        for before in (0, 1):
+            k = np.maximum(near - before, 0)[..., None]
+            start = np.take_along_axis(q, k, axis=1)
+            way = np.take_along_axis(q, k + 1, axis=1) - start
+            square = (way**2).sum(axis=-1)
+            offset = p - start
+            along = (offset * way).sum(axis=-1)
+            across = np.abs(offset[..., 0] * way[..., 1] - offset[..., 1] * way[..., 0])
+            inside = (along > 0) & (along < square) & (across < within * np.sqrt(square))
+            out[part] |= inside.any(axis=1)
+    return out
 
 
 def bands(lines: Array, half_width: float) -> NDArray[Any]:

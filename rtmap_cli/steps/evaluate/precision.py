@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.geometry.chamfer import bands, chamfer_pairs
-from rtmap_cli.geometry.polylines import resample
+from rtmap_cli.geometry.chamfer import bands, beside, chamfer_pairs, sample_lines
 
 Array = NDArray[np.float64]
 
@@ -167,19 +166,20 @@ class Scorer:
     def _sampled(self, lines: list[Array], keep: bool, where: str) -> Array:
         """(n, samples, 2) points at equal arc length."""
         count = self.protocol.samples
-        out = np.zeros((len(lines), count, 2))
-        for k, line in enumerate(lines):
-            points = np.asarray(line, dtype=np.float64)
+        lines = [np.asarray(line, dtype=np.float64) for line in lines]
+        for points in lines:
             if points.ndim != 2 or len(points) < 2:
                 raise BadInput(
                     where,
                     "an element has fewer than 2 vertices",
                     f"protocol {self.protocol.name} has no rule for it",
                 )
-            points = points[:, :2]
-            if not np.isfinite(points).all():
+            if not np.isfinite(points[:, :2]).all():
                 raise BadInput(where, "a vertex is not finite")
-            out[k] = points if keep and len(points) == count else resample(points, count)
+        out = sample_lines(lines, count)
+        for k, points in enumerate(lines):
+            if keep and len(points) == count:
+                out[k] = points[:, :2]
         return out
 
     def _distances(self, lines: Array, targets: Array) -> Array:
@@ -224,13 +224,19 @@ class Scorer:
 def _bands_touch(
     lines: Array, targets: Array, i: NDArray[np.intp], j: NDArray[np.intp], half_width: float
 ) -> NDArray[np.bool_]:
+    """(k,) whether the bands of lines[i] and targets[j] intersect; none of zero length does."""
     import shapely
 
-    left, left_of = np.unique(i, return_inverse=True)
-    right, right_of = np.unique(j, return_inverse=True)
-    a, b = bands(lines[left], half_width), bands(targets[right], half_width)
-    touch: NDArray[np.bool_] = shapely.intersects(a[left_of], b[right_of])
-    return touch
+    # A point of one line well inside the other's band settles it; buffers cost ten times as much.
+    long = [np.ptp(x, axis=1).max(axis=1) > 0 for x in (lines, targets)]
+    touch = beside(lines, targets, i, j, 0.95 * half_width) & long[0][i] & long[1][j]
+    rest = np.flatnonzero(~touch)
+    if len(rest):
+        left, left_of = np.unique(i[rest], return_inverse=True)
+        right, right_of = np.unique(j[rest], return_inverse=True)
+        a, b = bands(lines[left], half_width), bands(targets[right], half_width)
+        touch[rest] = shapely.intersects(a[left_of], b[right_of])
+    return np.asarray(touch, dtype=bool)
 
 
 def average_precision(hits: NDArray[np.bool_], num_gt: int) -> float:
