@@ -43,17 +43,23 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 class BevWarp(nn.Module):
-    """Images of N calibrated cameras → one picture (4 channels, values 0 … 255)."""
+    """Images of N calibrated cameras → one picture (4 channels, values 0 … 255).
 
+    The camera is chosen per cell; ``supersample``² points of the cell are read and averaged.
+    """
+
+    centres: Tensor
     ground: Tensor
 
     def __init__(self, half_x: float, half_y: float, rows: int, columns: int, supersample: int):
         super().__init__()
         self.rows, self.columns, self.supersample = rows, columns, supersample
+        centres = cell_centres(half_x, half_y, rows, columns).reshape(-1, 2)
         fine = cell_centres(half_x, half_y, rows * supersample, columns * supersample)
-        flat = fine.reshape(-1, 2)
-        ones = torch.ones(len(flat), 1)
-        ground = torch.cat([flat, torch.zeros_like(ones), ones], dim=1)
+        self.register_buffer("centres", centres.t().contiguous(), persistent=False)
+        # Points of a cell side by side: (x and y, points per cell, cells).
+        fine = fine.reshape(rows, supersample, columns, supersample, 2).permute(4, 1, 3, 0, 2)
+        ground = fine.reshape(2, supersample * supersample, -1).contiguous()
         self.register_buffer("ground", ground, persistent=False)
 
     def forward(self, images: Tensor, ego_to_image: Tensor) -> Tensor:
@@ -64,37 +70,61 @@ class BevWarp(nn.Module):
         coordinates do not survive bfloat16.
         """
         batch, cameras, height, width = images.shape[:4]
-        u, v, depth = (ego_to_image.float() @ self.ground.t()).unbind(2)  # each (B, N, cells)
-        safe = depth.clamp(min=0.1)
-        gx = (u / safe + 0.5) * (2.0 / width) - 1.0
-        gy = (v / safe + 0.5) * (2.0 / height) - 1.0
-        inside = 1.0 - torch.maximum(gx.abs(), gy.abs())
-        inside = torch.where(depth > MIN_DEPTH, inside, torch.full_like(inside, -1.0))
-        margin, best = inside.max(dim=1, keepdim=True)
-        seen = (margin > 0).float()  # (B, 1, cells)
-        gx, gy = gx.gather(1, best)[:, 0], gy.gather(1, best)[:, 0]
+        e = ego_to_image.float()
+        best, seen = self._choose(e, height, width)  # (B, cells)
+        gx, gy = self._look_up(e, best, height, width)  # (B, points per cell, cells)
         # All images of a sample stand one over the other, so that one sampling serves them all.
-        limit = 1.0 - 1.0 / height
-        gy = (best[:, 0].float() + (gy.clamp(-limit, limit) + 1.0) * 0.5) * 2.0 / cameras - 1.0
+        gy = (best.float()[:, None] + (gy + 1.0) * 0.5) * 2.0 / cameras - 1.0
         atlas = images.float().permute(0, 4, 1, 2, 3).reshape(batch, 3, cameras * height, width)
-        rows, columns = self.rows * self.supersample, self.columns * self.supersample
-        where = torch.stack([gx.clamp(-1, 1), gy], dim=-1).reshape(batch, rows, columns, 2)
         colour = F.grid_sample(
-            atlas, where, mode="bilinear", padding_mode="border", align_corners=False
-        )
-        seen = seen.reshape(batch, 1, rows, columns)
-        quality = self._quality(ego_to_image.float(), best).reshape(batch, 1, rows, columns)
-        picture = torch.cat([colour, quality * 255.0], dim=1) * seen
-        return F.avg_pool2d(picture, self.supersample) if self.supersample > 1 else picture
+            atlas,
+            torch.stack([gx, gy], dim=-1),
+            mode="bilinear",
+            padding_mode="border",
+            align_corners=False,
+        ).mean(dim=2)
+        quality = self._quality(e, best)[:, None] * 255.0
+        picture = torch.cat([colour, quality], dim=1) * seen[:, None]
+        return picture.reshape(batch, 4, self.rows, self.columns)
 
-    def _quality(self, ego_to_image: Tensor, best: Tensor) -> Tensor:
-        """(B, 1, cells): √(height / distance) of the camera chosen for each cell."""
-        centre = camera_centres(ego_to_image)  # (B, N, 3)
-        chosen = [centre[..., k].gather(1, best[:, 0]) for k in range(3)]
-        dx, dy = chosen[0] - self.ground[:, 0], chosen[1] - self.ground[:, 1]
-        height = chosen[2].clamp(min=0.0)
+    def _choose(self, e: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """(B, cells) the camera that sees each cell best, and 1 where one sees it at all."""
+        x, y = self.centres
+        u, v, depth = (
+            e[:, :, k, 0:1] * x + e[:, :, k, 1:2] * y + e[:, :, k, 3:4] for k in range(3)
+        )
+        inverse = 1.0 / depth.clamp(min=0.1)
+        gx = ((u * inverse + 0.5) * (2.0 / width) - 1.0).abs()
+        gy = ((v * inverse + 0.5) * (2.0 / height) - 1.0).abs()
+        inside = 1.0 - torch.maximum(gx, gy)
+        inside = torch.where(depth > MIN_DEPTH, inside, torch.full_like(inside, -1.0))
+        margin, best = inside.max(dim=1)
+        return best, (margin > 0).float()
+
+    def _look_up(
+        self, e: Tensor, best: Tensor, height: int, width: int
+    ) -> tuple[Tensor, Tensor]:
+        """(B, points per cell, cells) places in the image of the chosen camera, -1 … 1."""
+        x, y = self.ground
+        rows = []
+        for k in range(3):
+            a, b, d = (e[:, :, k, j].gather(1, best)[:, None] for j in (0, 1, 3))
+            rows.append(a * x + b * y + d)
+        inverse = 1.0 / rows[2].clamp(min=0.1)
+        # Half a pixel from the rim, so that no neighbour in the stack of images is read.
+        limit = 1.0 - 1.0 / height
+        gx = (rows[0] * inverse + 0.5) * (2.0 / width) - 1.0
+        gy = (rows[1] * inverse + 0.5) * (2.0 / height) - 1.0
+        return gx.clamp(-1.0, 1.0), gy.clamp(-limit, limit)
+
+    def _quality(self, e: Tensor, best: Tensor) -> Tensor:
+        """(B, cells): √(height / distance) of the camera chosen for each cell."""
+        centre = camera_centres(e)  # (B, N, 3)
+        x, y, height = (centre[..., k].gather(1, best) for k in range(3))
+        height = height.clamp(min=0.0)
+        dx, dy = x - self.centres[0], y - self.centres[1]
         distance = (dx * dx + dy * dy + height * height).sqrt().clamp(min=1e-3)
-        return (height / distance).clamp(0.0, 1.0).sqrt()[:, None]
+        return (height / distance).clamp(0.0, 1.0).sqrt()
 
 
 def normalize_picture(picture: Tensor) -> Tensor:

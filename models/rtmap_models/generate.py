@@ -1,0 +1,153 @@
+"""Training frames: small procedural towns, seen by random rigs, as bird's-eye pictures on disk.
+
+One shard is one town. Everything in it follows from the seed of the town, so that shards can be
+made in any order, by any number of processes, and again.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rtmap_cli.steps.simulate.render import render_cameras
+
+from rtmap_cli.geometry.cameras import projection
+from rtmap_cli.geometry.poses import se3_from_xyyaw
+from rtmap_cli.logs.log import Rig
+from rtmap_cli.maps.crop import MapIndex
+from rtmap_cli.steps.simulate.style import make_style
+from rtmap_cli.steps.simulate.town import Town, make_town
+from rtmap_cli.steps.simulate.world import world_from_map
+from rtmap_cli.steps.simulate.world_objects import random_occluders
+from rtmap_models.bev import BevWarp
+from rtmap_models.config import ModelConfig
+from rtmap_models.dataset import SCENE_MARGIN_M, window_half, window_size, write_shard
+from rtmap_models.rigs import sample_rig
+from rtmap_models.samples import Array, Scene
+
+FRAMES_PER_TOWN = 24
+TOWN_SIZES = (150.0, 220.0, 320.0)
+
+
+@dataclass(frozen=True)
+class View:
+    """One frame as the network gets it, and the truth around it."""
+
+    images: NDArray[np.uint8]  # (N, H, W, 3)
+    ego_to_image: NDArray[np.float32]  # (N, 3, 4)
+    scene: Scene
+    map_SE3_ego: Array
+
+
+def town_views(config: ModelConfig, seed: int, count: int) -> Iterator[View]:
+    """Frames of one town, one rig, one style: all from ``seed``."""
+    rng = np.random.default_rng([seed, 0x746F776E])
+    town = make_town(seed, TOWN_SIZES[rng.choice(3, p=[0.5, 0.3, 0.2])])
+    world = world_from_map(town.vector_map, seed)
+    index = MapIndex(town.vector_map, join=True)
+    rig, style = sample_rig(config, rng), make_style(rng)
+    for _ in range(count):
+        pose = random_pose(town, rng)
+        occluders = random_occluders(world, pose, rng, float(rng.choice([0.0, 3.0, 7.0])))
+        images = render_cameras(world, pose, rig.cameras, style, occluders, rng)
+        yield View(np.stack(images), projections(rig), scene_at(index, pose, config), pose)
+
+
+def projections(rig: Rig) -> NDArray[np.float32]:
+    """(N, 3, 4) of the cameras of a rig whose ego frame lies on the road."""
+    rows = [projection(c.intrinsics, c.ego_SE3_camera) for c in rig]
+    return np.stack(rows).astype(np.float32)
+
+
+def random_pose(town: Town, rng: np.random.Generator) -> Array:
+    """A pose near a lane centre, along the lane (σ 0.3 m, 3°), in one case of ten askew."""
+    lengths = np.array([len(lane) for lane in town.lanes], dtype=np.float64)
+    lane = town.lanes[rng.choice(len(town.lanes), p=lengths / lengths.sum())]
+    k = rng.integers(len(lane) - 1)
+    start, step = lane[k], lane[k + 1] - lane[k]
+    x, y = start + rng.random() * step
+    askew = rng.random() < 0.1
+    yaw = np.arctan2(step[1], step[0]) + rng.normal(0, 0.25 if askew else 0.05)
+    side = rng.normal(0, 0.8 if askew else 0.3)
+    return se3_from_xyyaw(x - side * np.sin(yaw), y + side * np.cos(yaw), yaw)
+
+
+def scene_at(index: MapIndex, pose: Array, config: ModelConfig) -> Scene:
+    """The elements around a pose, also a little outside the range."""
+    local = index.crop(pose, config.range_m, margin=SCENE_MARGIN_M)
+    local = [e for e in local if e.class_name in config.classes]
+    points = [e.points[:, :2] for e in local]
+    return Scene(
+        np.concatenate([*points, np.zeros((0, 2))]),
+        np.cumsum([0] + [len(p) for p in points]).astype(np.int64),
+        np.array([config.classes.index(e.class_name) for e in local], dtype=np.int64),
+    )
+
+
+def generate(
+    config: ModelConfig,
+    folder: Path,
+    frames: int,
+    seed: int,
+    workers: int,
+    report: Callable[[str], None],
+    per_town: int = FRAMES_PER_TOWN,
+) -> None:
+    """Fill ``folder`` with towns ``seed · 100000 + 0, 1, …`` until it holds ``frames`` frames.
+
+    Shards that are there already are kept: an interrupted run goes on where it stopped.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    sizes = [min(per_town, frames - start) for start in range(0, frames, per_town)]
+    jobs = [
+        (config, folder, seed * 100_000 + k, count)
+        for k, count in enumerate(sizes)
+        if not (folder / f"{_name(seed * 100_000 + k)}.json").exists()
+    ]
+    if not jobs:
+        return
+    report(f"rendering {sum(j[3] for j in jobs)} frames of {len(jobs)} towns into {folder}")
+    workers = min(workers, len(jobs))
+    if workers == 1:
+        made = map(_one_town, jobs)
+        _watch(made, len(jobs), report)
+        return
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        _watch(pool.imap_unordered(_one_town, jobs), len(jobs), report)
+
+
+def _watch(made: Iterator[str], count: int, report: Callable[[str], None]) -> None:
+    for done, name in enumerate(made, start=1):
+        if done % 10 == 0 or done == count:
+            report(f"{done} of {count} towns ({name})")
+
+
+def _name(seed: int) -> str:
+    return f"town-{seed:07d}"
+
+
+def _one_town(job: tuple[ModelConfig, Path, int, int]) -> str:
+    config, folder, seed, count = job
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    torch.set_num_threads(1)
+    warp = BevWarp(*window_half(config), *window_size(config), config.supersample)
+    pictures, scenes = [], []
+    for view in town_views(config, seed, count):
+        pictures.append(wide_picture(warp, view))
+        scenes.append(view.scene)
+    write_shard(folder, _name(seed), np.stack(pictures), scenes, {"town": seed})
+    return _name(seed)
+
+
+@torch.no_grad()
+def wide_picture(warp: BevWarp, view: View) -> NDArray[np.uint8]:
+    """(rows, columns, 4) bird's-eye picture of a view, by the module that the graph runs."""
+    images = torch.from_numpy(view.images)[None]
+    picture = warp(images, torch.from_numpy(view.ego_to_image)[None])[0]
+    return picture.round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous().numpy()

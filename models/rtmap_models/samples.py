@@ -56,7 +56,7 @@ class PriorNoise:
     In 40 % of the samples the crop is up to ``margin_m`` wider than the range.
     """
 
-    sigma_m: float = 1.2
+    sigma_m: float = 1.3
     sigma_deg: float = 1.2
     drop: float = 0.15
     fake: float = 0.15

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -23,6 +24,12 @@ NEEDS = "the export needs the extra 'train': pip install 'rtmap[train]'"
     help="What it was trained on, for the metadata.",
 )
 @click.option("--licence", default="Apache-2.0", show_default=True, help="For the metadata.")
+@click.option(
+    "--calibrate",
+    type=options.PATH,
+    help="Frames that training did not see (made by rtmap train --frames --data): sigmas and the "
+    "pose covariance are scaled to be honest on them.",
+)
 @options.as_json
 @options.overwrite
 def command(
@@ -31,6 +38,7 @@ def command(
     name: str | None,
     training_data: str,
     licence: str,
+    calibrate: Path | None,
     as_json: bool,
     overwrite: bool,
 ) -> None:
@@ -54,15 +62,27 @@ def command(
 
     network, content = load_network(weights)
     amount = f"{content['frames']} frames, {content['samples']} samples"
-    metadata = {
+    metadata: dict[str, Any] = {
         "training_data": f"{training_data}: {amount}",
         "licence": licence,
         "code_sha": code_version(),
     }
     if name:
         metadata["model_name"] = name
+    factors: dict[str, float] = {}
+    if calibrate is not None:
+        from rtmap_models.calibrate import calibrate as scale
+        from rtmap_models.dataset import Frames
+
+        factors = scale(network, Frames(calibrate, network.config))
+        metadata["calibration"] = factors
     differences = export_onnx(network, output, metadata)
     megabytes = output.stat().st_size / 1e6
-    result = {"model": str(output), "megabytes": megabytes, "differences": differences}
+    result = {
+        "model": str(output),
+        "megabytes": megabytes,
+        "differences": differences,
+        "calibration": factors,
+    }
     worst = max(differences.values())
     emit(result, as_json, [f"{output}: {megabytes:.1f} MB, differs from torch by {worst:.1g}"])

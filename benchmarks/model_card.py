@@ -1,0 +1,272 @@
+"""Every figure of a model's card: unseen towns, a real map, latency.
+
+    python benchmarks/model_card.py models/rtmap_models/zoo/rtmap-tiny.onnx \\
+        --av2 "$RTMAP_DATA/av2_sensor/7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
+
+Needs the extras ``train`` and ``simulate`` (torch only because the frames come from the package
+that trains). Images are rendered; the model runs in onnxruntime from images to answers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rtmap_models.config import ModelConfig, load_config
+from rtmap_models.generate import View, projections, scene_at, town_views
+from rtmap_models.samples import Pieces, Prior, PriorNoise, clip, make_prior
+from scipy.stats import spearmanr
+
+from rtmap_cli.formats.av2 import Av2Log, read_av2_map
+from rtmap_cli.geometry.cameras import fit_camera
+from rtmap_cli.logs.log import Rig
+from rtmap_cli.maps.crop import MapIndex
+from rtmap_cli.steps.evaluate.precision import Scorer
+from rtmap_cli.steps.infer.model import MapModel
+from rtmap_cli.steps.simulate.render import render_cameras
+from rtmap_cli.steps.simulate.style import make_style
+from rtmap_cli.steps.simulate.world import world_from_map
+
+TEST_SEED = 90_000_000
+"""Towns from this seed on are neither trained nor calibrated with."""
+
+PRIORS: dict[str, PriorNoise | None] = {
+    "without prior": None,
+    "prior, 1 m / 1°": PriorNoise(1.0, 1.0, 0.0, 0.0, 0.0),
+    "prior, 1 m / 1°, 15 % missing, 15 % false": PriorNoise(1.0, 1.0, 0.15, 0.15, 0.0),
+    "prior, 2 m / 2°, 15 % missing, 15 % false": PriorNoise(2.0, 2.0, 0.15, 0.15, 0.0),
+}
+
+
+def unseen_towns(config: ModelConfig, towns: int, frames: int) -> Iterator[View]:
+    """Frames of towns that training never drew."""
+    for k in range(towns):
+        yield from town_views(config, TEST_SEED + k, frames)
+
+
+def real_map(config: ModelConfig, log_path: Path, frames: int) -> Iterator[View]:
+    """Simulated images over the map of an Argoverse 2 log, its rig, its poses, its cuboids."""
+    log, rng = Av2Log(log_path), np.random.default_rng(0)
+    vector_map = read_av2_map(log_path)
+    world, index = world_from_map(vector_map, 0), MapIndex(vector_map, join=True)
+    style = make_style(rng)
+    if log.rig is None:
+        raise SystemExit(f"{log_path}: the log has no calibration")
+    rig = Rig(tuple(_fitted(c, config, log.ground_z) for c in log.rig))
+    drop = np.eye(4)
+    drop[2, 3] = log.ground_z
+    chosen = set(np.linspace(0, len(log) - 1, frames).round().astype(int).tolist())
+    for k, frame in enumerate(log.frames()):
+        if k not in chosen:
+            continue
+        pose = frame.map_SE3_ego @ drop
+        boxes = tuple(replace(o, z=o.z - log.ground_z) for o in frame.occluders)
+        images = render_cameras(world, pose, rig.cameras, style, boxes, rng)
+        yield View(np.stack(images), projections(rig), scene_at(index, pose, config), pose)
+
+
+def _fitted(camera: Any, config: ModelConfig, ground_z: float) -> Any:
+    """The camera at the model's image size, in the frame dropped to the road, undistorted."""
+    pose = camera.ego_SE3_camera.copy()
+    pose[2, 3] -= ground_z
+    size = (camera.height, camera.width)
+    _, k = fit_camera(camera.intrinsics, pose, size, config.image_size, config.horizon)
+    height, width = config.image_size
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        intrinsics=k,
+        ego_SE3_camera=pose,
+        distortion=(0.0, 0.0, 0.0),
+    )
+
+
+def detections(
+    out: dict[str, NDArray[Any]], config: ModelConfig, floor: float = 0.02
+) -> list[tuple[str, NDArray[np.float64], float]]:
+    """Class, vertices and score of every query that says something."""
+    scores, points = out["scores"][0], out["points"][0]
+    best = scores.argmax(axis=1)
+    return [
+        (config.classes[c], p.astype(np.float64), float(s[c]))
+        for s, p, c in zip(scores, points, best, strict=True)
+        if s[c] > floor
+    ]
+
+
+def run(model: MapModel, config: ModelConfig, view: View, prior: Prior | None) -> dict[str, Any]:
+    """One frame through onnxruntime."""
+    slots = max(1, len(prior.classes) if prior else 0)
+    points = np.zeros((1, slots, config.vertex_count, 2), np.float32)
+    class_id, mask = np.zeros((1, slots), np.int64), np.zeros((1, slots), np.float32)
+    if prior is not None and len(prior.classes):
+        points[0], class_id[0], mask[0] = prior.points, prior.classes, 1.0
+    return model(view.images[None], view.ego_to_image[None], points, class_id, mask)
+
+
+def measure(
+    model: MapModel, config: ModelConfig, views: list[View], noise: PriorNoise | None
+) -> dict[str, Any]:
+    """All figures of one set of frames with one kind of prior."""
+    rng = np.random.default_rng(1)
+    scorer, unchanged = (Scorer(config.classes, protocol="rtmap") for _ in range(2))
+    exist: list[tuple[float, bool]] = []
+    pose: list[NDArray[np.float64]] = []
+    spread: list[NDArray[np.float64]] = []
+    for view in views:
+        truth = clip(view.scene, config, min_length=0.5)
+        prior = None
+        if noise is not None:
+            prior = make_prior(view.scene, clip(view.scene, config), config, noise, rng)
+        out = run(model, config, view, prior)
+        true = _detections_of(truth.points, truth.classes, config)
+        scorer.add(detections(out, config), true)
+        if prior is None:
+            spread.append(_errors_of_found(out, truth, config))
+            continue
+        unchanged.add(_detections_of(prior.points, prior.classes, config), true)
+        exist += list(zip(out["prior_score"][0].tolist(), prior.real.tolist(), strict=False))
+        sigma = np.sqrt(np.diag(out["pose_covariance"][0]))
+        pose.append(np.stack([prior.delta, out["pose_delta"][0] - prior.delta, sigma]))
+        spread.append(_errors_of_prior(out, prior))
+    result: dict[str, Any] = {"map": scorer.result().as_json()} | _honesty(spread)
+    if noise is not None:
+        result["unchanged prior mAP"] = unchanged.result().mAP
+        result["existence AUC"] = _auc(exist)
+        result["pose"] = _pose_figures(np.array(pose))
+    return result
+
+
+def _detections_of(
+    points: NDArray[np.float64], classes: NDArray[np.int64], config: ModelConfig
+) -> list[tuple[str, NDArray[np.float64], float]]:
+    return [(config.classes[c], p, 1.0) for p, c in zip(points, classes, strict=True)]
+
+
+def _errors_of_prior(out: dict[str, Any], prior: Prior) -> NDArray[np.float64]:
+    """(n, 2): |error| and sigma of every coordinate of real prior slots."""
+    n = out["scores"].shape[1] - out["prior_score"].shape[1]
+    points, sigma = (out[k][0, n : n + len(prior.real)][prior.real] for k in ("points", "sigma"))
+    return np.stack([np.abs(points - prior.target[prior.real]), sigma], axis=-1).reshape(-1, 2)
+
+
+def _errors_of_found(
+    out: dict[str, Any], truth: Pieces, config: ModelConfig
+) -> NDArray[np.float64]:
+    """(n, 2): error and sigma across the line of confident new elements near their truth."""
+    parts = [np.zeros((0, 2))]
+    scores = out["scores"][0]
+    for p, sigma, s in zip(out["points"][0], out["sigma"][0], scores, strict=True):
+        same = truth.points[truth.classes == s.argmax()]
+        if s.max() < 0.4 or len(same) == 0:
+            continue
+        a, b = same[:, :-1], same[:, 1:]
+        d = b - a
+        t = ((p[:, None, None] - a) * d).sum(-1) / np.maximum((d * d).sum(-1), 1e-9)
+        gap = a + np.clip(t, 0, 1)[..., None] * d - p[:, None, None]
+        best = np.hypot(gap[..., 0], gap[..., 1]).min(axis=2).mean(axis=0).argmin()
+        gap = gap[:, best]
+        near = np.hypot(gap[..., 0], gap[..., 1]).argmin(axis=1)
+        gap, along = gap[np.arange(len(p)), near], d[best][near]
+        if np.hypot(gap[:, 0], gap[:, 1]).mean() > 1.5:
+            continue
+        unit = along / np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)[:, None]
+        normal = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+        across = np.hypot(normal[:, 0] * sigma[:, 0], normal[:, 1] * sigma[:, 1])
+        parts.append(np.stack([np.abs((gap * normal).sum(1)), across], axis=1))
+    return np.concatenate(parts)
+
+
+def _honesty(parts: list[NDArray[np.float64]]) -> dict[str, float]:
+    """Rank correlation of sigma and error; shares within the 50 % and 90 % Laplace regions."""
+    both = np.concatenate([*parts, np.zeros((0, 2))])
+    if len(both) < 10:
+        return {}
+    error, scale = both[:, 0], both[:, 1] / np.sqrt(2)
+    return {
+        "mean error m": float(error.mean()),
+        "sigma spearman": float(spearmanr(error, both[:, 1])[0]),
+        "within 50 %": float((error < scale * np.log(2)).mean()),
+        "within 90 %": float((error < scale * np.log(10)).mean()),
+    }
+
+
+def _auc(pairs: list[tuple[float, bool]]) -> float | None:
+    score, real = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs], dtype=bool)
+    if real.all() or not real.any():
+        return None
+    a, b = score[real][:, None], score[~real][None]
+    return float(((a > b) + 0.5 * (a == b)).mean())
+
+
+def _pose_figures(pose: NDArray[np.float64]) -> dict[str, list[float]]:
+    """Longitudinal m, lateral m, yaw °: before, after, median after, shares within 50 % / 90 %."""
+    unit = np.array([1.0, 1.0, np.degrees(1.0)])
+    before, error, sigma = np.abs(pose[:, 0]), np.abs(pose[:, 1]), pose[:, 2]
+    return {
+        "start": (before.mean(0) * unit).tolist(),
+        "mean": (error.mean(0) * unit).tolist(),
+        "median": (np.median(error, axis=0) * unit).tolist(),
+        "90th percentile": (np.quantile(error, 0.9, axis=0) * unit).tolist(),
+        "within 50 %": (error < 0.6745 * sigma).mean(0).tolist(),
+        "within 90 %": (error < 1.6449 * sigma).mean(0).tolist(),
+    }
+
+
+def latency(path: Path, config: ModelConfig, view: View) -> dict[str, dict[str, float]]:
+    """Milliseconds per frame, one frame at a time, by threads."""
+    prior = make_prior(
+        view.scene,
+        clip(view.scene, config),
+        config,
+        PriorNoise(1.0, 1.0, 0.0, 0.0, 0.0),
+        np.random.default_rng(0),
+    )
+    out = {}
+    for threads in (1, 2):
+        model, times = MapModel(str(path), threads), []
+        for _ in range(40):
+            start = time.perf_counter()
+            run(model, config, view, prior)
+            times.append((time.perf_counter() - start) * 1e3)
+        ms = np.array(times[5:])
+        out[f"{threads} threads"] = {
+            "median ms": float(np.median(ms)),
+            "90th percentile ms": float(np.quantile(ms, 0.9)),
+        }
+    return out
+
+
+def main() -> None:
+    """Measure and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("model", type=Path)
+    parser.add_argument("--config", default="rtmap-tiny")
+    parser.add_argument("--towns", type=int, default=40)
+    parser.add_argument("--frames", type=int, default=6, help="per town")
+    parser.add_argument("--av2", type=Path, help="log for the out-of-domain test")
+    parser.add_argument("--av2-frames", type=int, default=64)
+    a = parser.parse_args()
+    config, model = load_config(a.config), MapModel(str(a.model))
+    sets = {"unseen towns": list(unseen_towns(config, a.towns, a.frames))}
+    if a.av2:
+        sets["real map"] = list(real_map(config, a.av2, a.av2_frames))
+    report: dict[str, Any] = {"model": model.info.name, "sha256": model.info.sha256}
+    for name, views in sets.items():
+        report[name] = {"frames": len(views)}
+        for prior, noise in PRIORS.items():
+            report[name][prior] = measure(model, config, views, noise)
+    report["latency"] = latency(a.model, config, sets["unseen towns"][0])
+    print(json.dumps(report, indent=1, default=float, ensure_ascii=False))
+
+
+if __name__ == "__main__":
+    main()
