@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
+HORIZON = 1e-3
+"""Slope of a ray below which it meets no ground (1.6 km away)."""
+
 HALF_WIDTHS = (20.0, 40.0, 72.0, 128.0)
 """Half widths (m) of the ground windows of the levels at a base resolution of 0.125 m."""
 
@@ -156,30 +159,35 @@ def _ground_and_sky(
     r = pose[:3, :3].astype(np.float32)
     down = r[2, 0] * rx + r[2, 1] * ry + r[2, 2]
     rise = np.float32(pose[2, 3] - ground_z)
-    camera_x, camera_y = np.float32(pose[0, 3]), np.float32(pose[1, 3])
     out = np.empty((height, width, 3), np.float32)
-    # The horizon may be tilted: rows wholly above it need no ground at all.
-    below = down.reshape(height, rows, width).min(axis=(1, 2)) < -1e-3
-    first = int(np.argmax(below)) if below.any() else height
-    _paint_sky(out, down[::rows], style)
+    # The horizon may be tilted: the first rows hold no ground, the last ones no sky.
+    low, high = down.reshape(height, -1).min(axis=1), down[::rows].max(axis=1)
+    first = int(np.argmax(low < -HORIZON)) if (low < -HORIZON).any() else height
+    last = height - int(np.argmax(high[::-1] >= -HORIZON)) if (high >= -HORIZON).any() else 0
+    _paint_sky(out[:last], down[: last * rows : rows], style)
     if first == height:
         return out
     part = slice(first * rows, None)
     down, rx, ry = down[part], rx[part], ry[part]
-    depth = np.where(down < -1e-3, -rise / np.minimum(down, -1e-3), 1e4)
-    np.minimum(depth, 1e4, out=depth)
-    gx = camera_x + depth * (r[0, 0] * rx + r[0, 1] * ry + r[0, 2])
-    gy = camera_y + depth * (r[1, 0] * rx + r[1, 1] * ry + r[1, 2])
-    mx = np.float32(turn[0, 0]) * gx + np.float32(turn[0, 1]) * gy
-    my = np.float32(turn[1, 0]) * gx + np.float32(turn[1, 1]) * gy
+    depth = rise / np.maximum(-down, np.float32(HORIZON))
+    # Ego ground coordinates, then the same relative to the vehicle in map axes.
+    m = (turn @ pose[:2, :3]).astype(np.float32)
+    zero = (turn @ pose[:2, 3]).astype(np.float32)
+    mx = zero[0] + depth * (m[0, 0] * rx + m[0, 1] * ry + m[0, 2])
+    my = zero[1] + depth * (m[1, 0] * rx + m[1, 1] * ry + m[1, 2])
     layers = _sample(cv2, mx, my, depth, fx, float(rise), rows, windows, base, origin)
     colour = cv2.transform(layers[0], palette[0])
     colour += cv2.transform(layers[1], palette[1])
-    distance = depth[::rows]
-    haze = (1 - np.exp(-distance / np.float32(style.visibility)))[..., None]
-    colour += haze * (np.array(style.haze, np.float32) - colour)
-    ground = down[::rows] < -1e-3
-    out[first:][ground] = colour[ground]
+    clear = np.exp(depth[::rows] * np.float32(-1 / style.visibility))[..., None]
+    haze = np.array(style.haze, np.float32)
+    colour -= haze
+    colour *= clear
+    colour += haze
+    mixed = last - first
+    if mixed > 0:
+        ground = down[: mixed * rows : rows] < -HORIZON
+        out[first:last][ground] = colour[:mixed][ground]
+    out[max(first, last) :] = colour[max(mixed, 0) :]
     return out
 
 
@@ -201,7 +209,7 @@ def _sample(
     per image row are averaged, because the ground is foreshortened along the view.
     """
     count = len(depth) // rows
-    middle = depth[:: rows, depth.shape[1] // 2]
+    middle = depth[::rows, depth.shape[1] // 2]
     # Geometric mean of the footprint across (s / f) and along the view (s² / (f·h)).
     footprint = middle / focal * np.sqrt(np.maximum(1.0, middle / rise / rows))
     wanted = np.clip(np.round(np.log2(np.maximum(footprint / base, 1e-3))), 0, LEVELS - 1)
@@ -226,9 +234,7 @@ def _sample(
                 windows[k][n], fixed, weights, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
             )
             if rows > 1:
-                layer = cv2.resize(
-                    layer, (mx.shape[1], end - start), interpolation=cv2.INTER_AREA
-                )
+                layer = cv2.resize(layer, (mx.shape[1], end - start), interpolation=cv2.INTER_AREA)
             out[n][start:end] = layer
     return out[0], out[1]
 

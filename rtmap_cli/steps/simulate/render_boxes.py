@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 FACES = ((0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7), (4, 5, 6, 7))
-NORMALS = np.array([[1, 0, 0], [0, -1, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
 """Sides and top of a box with corners (+,+), (+,-), (-,-), (-,+), first the bottom ones."""
+SIDES = np.radians([0.0, -90.0, 180.0, 90.0])
+"""Directions of the four sides in the axes of the box."""
 
 NEAR = 0.15
 """Nearest depth that is drawn, metres."""
@@ -33,14 +34,21 @@ def scene_boxes(
     style: Style,
     ground_z: float,
 ) -> Array:
-    """(n, 11) boxes in the ego frame: what stands beside the road, then the vehicles."""
+    """(n, 11) boxes in the ego frame, far ones first: roadside objects and vehicles.
+
+    The parts of a vehicle keep their order, whatever their own distances.
+    """
     still = objects_near(world, map_SE3_ego)
     still[:, 5:7] += ground_z
     rows: list[list[float]] = []
+    away: list[float] = []
     for vehicle in occluders:
-        rows += _vehicle(vehicle, style)
+        parts = _vehicle(vehicle, style)
+        rows += parts
+        away += [float(np.hypot(vehicle.x, vehicle.y))] * len(parts)
     moving = np.array(rows).reshape(-1, len(OBJECT_COLUMNS))
-    return np.concatenate([still, moving])
+    distance = np.concatenate([np.hypot(still[:, 0], still[:, 1]), away])
+    return np.concatenate([still, moving])[np.argsort(-distance, kind="stable")]
 
 
 def _vehicle(v: Occluder, style: Style) -> list[list[float]]:
@@ -73,11 +81,10 @@ def _vehicle(v: Occluder, style: Style) -> list[list[float]]:
 def draw_boxes(
     cv2: Any, image: NDArray[np.float32], camera: Camera, pose: Array, boxes: Array, style: Style
 ) -> None:
-    """Draw boxes (ego frame) into a float image, far ones first, with haze and shading."""
+    """Draw boxes (ego frame, in this order) into a float image, with haze and shading."""
     if not len(boxes):
         return
     rotation, place = pose[:3, :3], pose[:3, 3]
-    # Sorting by the nearest part of the centre line of sight is enough for boxes apart.
     away = boxes[:, :2] - place[:2]
     distance = np.hypot(away[:, 0], away[:, 1])
     ahead = away @ rotation[:2, 2]
@@ -86,11 +93,8 @@ def draw_boxes(
     half = camera.width / (2 * camera.intrinsics[0, 0])
     seen = (ahead > -radius) & (side < np.maximum(ahead, 0) * (half + 0.15) + 1.5 * radius + 0.5)
     seen &= radius * camera.intrinsics[0, 0] > 0.15 * np.maximum(ahead, 0.1)
-    # The body lies before its cabin and roof in the table: a stable sort keeps that order.
-    order = np.flatnonzero(seen)
-    order = order[np.argsort(-np.round(distance[order], 1), kind="stable")]
     haze = np.array(style.haze)
-    for k in order:
+    for k in np.flatnonzero(seen):
         box = boxes[k]
         fog = 1 - np.exp(-distance[k] / style.visibility)
         if box[10] == CROWN:
@@ -118,23 +122,36 @@ def _box(
     local = (corners - place) @ rotation
     if local[:, 2].max() < NEAR:
         return
+    whole = local[:, 2].min() >= NEAR
+    uv = project(camera, local) if whole else None
+    if uv is not None:
+        (u0, v0), (u1, v1) = uv.min(axis=0), uv.max(axis=0)
+        if u1 < 0 or v1 < 0 or u0 > camera.width or v0 > camera.height:
+            return
+    # The viewer in the axes of the box tells which faces are turned towards it.
     c, s = np.cos(box[2]), np.sin(box[2])
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    normals = NORMALS @ turn.T
+    dx, dy = place[0] - box[0], place[1] - box[1]
+    along, across = c * dx + s * dy, c * dy - s * dx
+    seen = (
+        along > box[3] / 2,
+        across < -box[4] / 2,
+        along < -box[3] / 2,
+        across > box[4] / 2,
+        place[2] > box[6],
+    )
+    lit = style.contrast * np.cos(style.sun - box[2] - SIDES)
     for n, face in enumerate(FACES):
-        if normals[n] @ (place - corners[face[0]]) <= 0:
+        if not seen[n]:
             continue
-        polygon = _clip_near(local[list(face)])
-        if polygon is None:
-            continue
-        light = 1.08 if n == 4 else 0.82 + style.contrast * float(normals[n, :2] @ _sun(style))
+        light = 1.08 if n == 4 else 0.82 + lit[n]
         colour = box[7:10] * light
         colour = colour + fog * (haze - colour)
-        _fill(cv2, image, camera, polygon, colour)
-
-
-def _sun(style: Style) -> Array:
-    return np.array([np.cos(style.sun), np.sin(style.sun)])
+        if uv is not None:
+            _fill(cv2, image, uv[list(face)], colour)
+            continue
+        polygon = _clip_near(local[list(face)])
+        if polygon is not None:
+            _fill(cv2, image, project(camera, polygon), colour)
 
 
 def _crown(
@@ -186,12 +203,7 @@ def project(camera: Camera, local: Array) -> Array:
     return np.stack([u, k[1, 1] * xy[:, 1] + k[1, 2]], axis=-1)
 
 
-def _fill(
-    cv2: Any, image: NDArray[np.float32], camera: Camera, polygon: Array, colour: Array
-) -> None:
-    uv = project(camera, polygon)
-    low, high = uv.min(axis=0), uv.max(axis=0)
-    if high[0] < 0 or high[1] < 0 or low[0] > camera.width or low[1] > camera.height:
-        return
+def _fill(cv2: Any, image: NDArray[np.float32], uv: Array, colour: Array) -> None:
+    """Fill a convex polygon given in pixels."""
     points = np.round(np.clip(uv, -30_000, 30_000) * 16).astype(np.int32)
     cv2.fillConvexPoly(image, points, colour.tolist(), cv2.LINE_AA, 4)

@@ -138,9 +138,7 @@ def _make_roundabout(
 ) -> None:
     """Turn the junction nearest to the middle of the town into a roundabout."""
     best = min(junctions, key=lambda j: float(np.hypot(*j.place)))
-    widths = [
-        max(streets[a.street].profile.half_width(k) for k in (0, 1)) for a in best.arms
-    ]
+    widths = [max(streets[a.street].profile.half_width(k) for k in (0, 1)) for a in best.arms]
     best.radius = max(float(rng.uniform(15, 19)), max(widths) * 1.35 + 4)
     best.island = best.radius - float(rng.uniform(6.0, 7.5))
     for arm in best.arms:
@@ -168,7 +166,9 @@ def _crossings(
             arm.stop = gap + depth + rng.uniform(0.8, 2.0)
             left, right = street.profile.half_width(0), -street.profile.half_width(1)
             sides = ((0.0, left, gap), (1.0, right, gap), (1.0, right, gap + depth))
-            quad = [street.at(arm.station(k, d), o) for k, o, d in (*sides, (0.0, left, gap + depth))]
+            quad = [
+                street.at(arm.station(k, d), o) for k, o, d in (*sides, (0.0, left, gap + depth))
+            ]
             out.append((np.array([*quad, quad[0]]), pattern))
     for index, street in enumerate(streets):
         if rng.random() < 0.35 * street.profile.crossings:

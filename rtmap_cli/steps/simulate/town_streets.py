@@ -61,9 +61,7 @@ class Profile:
                 lines.append((0.0, self.centre_mark))
         for side, count in ((1.0, self.backward), (-1.0, self.forward)):
             if self.lane_mark:
-                lines += [
-                    (side * (half + k * self.lane), self.lane_mark) for k in range(1, count)
-                ]
+                lines += [(side * (half + k * self.lane), self.lane_mark) for k in range(1, count)]
             index = 0 if side > 0 else 1
             edge = half + count * self.lane
             beyond = self.bike[index] + self.shoulder[index]

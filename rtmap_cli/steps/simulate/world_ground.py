@@ -61,7 +61,7 @@ def _noise(field: int, x0: float, y0: float, step: float, unit: float) -> NDArra
     k = np.arange(TILE)
     cols = np.floor((x0 + k * step) / unit).astype(np.int64) % NOISE_SIZE
     rows = np.floor((y0 + k * step) / unit).astype(np.int64) % NOISE_SIZE
-    return noise_fields()[field][np.ix_(rows, cols)]
+    return noise_fields()[field][rows][:, cols]
 
 
 def _layout(world: World) -> dict[str, Any]:
