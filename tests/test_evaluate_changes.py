@@ -123,6 +123,19 @@ def test_command(rtmap: Any, tmp_path: Path) -> None:
     rtmap(*command, "--fail-under", "speed=1", code=2)
 
 
+def test_changes_of_a_run(rtmap: Any, tmp_path: Path) -> None:
+    from rtmap_cli.formats.changes import ChangeEvent, write_change_table
+    from rtmap_cli.maps.evidence import Counts
+
+    _, truth = write_changes(tmp_path)
+    counts = Counts(3, 4, 1, 1, 1, 2, ("r",))
+    event = ChangeEvent("c", "insert", "divider", None, line(0, 19) + ORIGIN, 0.9, 2.2, counts)
+    (tmp_path / "run").mkdir()
+    write_change_table([event], tmp_path / "run" / "changes.parquet", CRS)
+    got = json.loads(rtmap("evaluate", "changes", tmp_path / "run", "--truth", truth, "--json").out)
+    assert (got["found"], got["false"]) == (1, 0)
+
+
 def test_frame_level_along_poses(rtmap: Any, tmp_path: Path) -> None:
     path, truth = write_changes(tmp_path)
     n = 31

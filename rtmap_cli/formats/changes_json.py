@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
+from rtmap_cli.maps.crs import to_lonlat
 from rtmap_cli.tables import read_json
 
 Array = NDArray[np.float64]
@@ -41,10 +42,16 @@ class ChangeFile:
 
 
 def read_changes(path: str | Path) -> ChangeFile:
-    """Read either form; a run folder stands for its changes.geojson. BadInput names the change."""
+    """Read either form, or a changes.parquet; BadInput names the change that is wrong.
+
+    A folder stands for its changes.geojson, a run without one for its changes.parquet.
+    """
     path = Path(path)
     if path.is_dir():
-        path = path / "changes.geojson"
+        names = ("changes.geojson", "changes.parquet")
+        path = path / next((n for n in names if (path / n).exists()), names[0])
+    if path.suffix == ".parquet":
+        return _table(path)
     data = read_json(path)
     if isinstance(data, dict) and isinstance(data.get("features"), list):
         changes = [_feature(path, k, f) for k, f in enumerate(data["features"])]
@@ -54,6 +61,25 @@ def read_changes(path: str | Path) -> ChangeFile:
         raise BadInput(path, "holds neither features nor changes", "see docs/evaluate.md")
     area = data.get("area")
     return ChangeFile(changes, None if area is None else _area(path, area))
+
+
+def _table(path: Path) -> ChangeFile:
+    from rtmap_cli.formats.changes import read_change_table
+
+    events, crs = read_change_table(path)
+    return ChangeFile(
+        [
+            ChangeRecord(
+                kind=e.kind,
+                class_name=e.class_name,
+                lonlat=to_lonlat(crs, e.points[:, :2]),
+                probability=e.probability,
+                change_id=e.change_id,
+                element_id=e.element_id or "",
+            )
+            for e in events
+        ]
+    )
 
 
 def _feature(path: Path, number: int, feature: Any) -> ChangeRecord:
