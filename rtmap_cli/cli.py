@@ -41,6 +41,7 @@ COMMANDS: dict[str, Any] = {
         {
             "town": ("simulate_town", "A procedural town becomes a map."),
             "changes": ("simulate_changes", "Change a map, with a truth file."),
+            "degrade": ("simulate_degrade", "A map less exact than the world: an old survey."),
             "images": ("simulate_images", "Render the cameras of a drive: a native log."),
             "observations": ("simulate_observations", "Observe a map without a network: a run."),
         },
