@@ -39,7 +39,7 @@ def test_degrade_writes_a_map_that_says_how_wrong_it_is(
               "-o", tmp_path / name)  # fmt: skip
     (a,), (b,), (c,) = (read_map(tmp_path / n) for n in "abc")
     np.testing.assert_array_equal(a.points, b.points)
-    assert not np.allclose(a.points, c.points)
+    assert np.abs(a.points - c.points).max() > 0.1
     assert np.diff(a.points[:, 0]).max() < 5.0 + 2.0
     np.testing.assert_allclose(a.covariance[:, [0, 2]], 0.09)
     assert 0.1 < np.abs(a.points[:, 1] - ORIGIN[1]).std() < 0.6
