@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from rtmap_cli.formats.changes import CHANGES_SCHEMA, CHANGES_VERSION, KINDS
 from rtmap_cli.formats.geojson import GEOJSON_SCHEMA, GEOJSON_VERSION
 from rtmap_cli.logs.run import RUN_SCHEMA, RUN_VERSION
 from rtmap_cli.logs.tables import LOG_SCHEMA, LOG_VERSION
@@ -152,11 +153,13 @@ def _map_geojson() -> Node:
 
 def _changes_geojson() -> Node:
     properties = {
+        "id": _text("the same as change_id"),
         "change_id": _text("id of the change"),
-        "kind": {"enum": ["insert", "delete", "modify"], "description": "seen from the map"},
+        "kind": {"enum": list(KINDS), "description": "seen from the map"},
         "class": _text("class of the element"),
         "element_id": _or_null(_text("map element that is gone or modified")),
         "probability": _number("that the change is real"),
+        "log_odds": _number("the same as log-odds"),
         "frames_seen": _integer("frames that support it"),
         "frames_in_view": _integer("frames that could have seen it"),
         "traversals_seen": _integer("drives that support it"),
@@ -165,8 +168,10 @@ def _changes_geojson() -> Node:
         "last_seen_ns": _or_null(_integer("ns since 1970-01-01T00:00:00Z")),
         "runs": _texts("ids of the runs behind it"),
     }
-    node = _collection(properties, list(properties), _geometry("LineString", "Polygon"))
-    return _document("rtmap.changes.geojson", "what `rtmap detect-changes` writes", node)
+    own = _object(_versioned(CHANGES_SCHEMA, CHANGES_VERSION), ["schema", "schema_version"])
+    geometry = _geometry("LineString", "Polygon")
+    node = _collection(properties, list(properties), geometry, rtmap=own)
+    return _document(CHANGES_SCHEMA, "what `rtmap detect-changes` writes", node)
 
 
 def _map_properties() -> Node:

@@ -101,3 +101,30 @@ def test_map_files_follow_their_schemas(tmp_path: Path) -> None:
     assert violations(schema("rtmap.map"), description) == []
     missing = set(schema("rtmap.map")["required"]) ^ set(description)
     assert not missing
+
+
+def test_changes_follow_their_schema(tmp_path: Path) -> None:
+    from rtmap_cli.formats.changes import ChangeEvent, write_changes
+    from rtmap_cli.maps.evidence import Counts
+
+    points = np.array([[585000.0, 4478000], [585010, 4478000]])
+    counts = Counts(3, 5, 1, 2, 10, None, ("drive-1",))
+    event = ChangeEvent("c1", "delete", "divider", "div-a", points, 0.9, 2.2, counts)
+    write_changes([event], "EPSG:32617", tmp_path / "changes.geojson")
+    value = json.loads((tmp_path / "changes.geojson").read_text(encoding="utf-8"))
+    assert violations(schema("rtmap.changes"), value) == []
+    found = value["features"][0]["properties"]
+    node = schema("rtmap.changes")["properties"]["features"]["items"]["properties"]["properties"]
+    assert set(found) == set(node["properties"])
+
+
+def test_logs_follow_their_schema(tmp_path: Path) -> None:
+    from rtmap_cli.logs.log import Frame
+    from rtmap_cli.logs.native import NativeLogWriter
+
+    writer = NativeLogWriter(tmp_path, "drive", "EPSG:32617", None)
+    writer.add(Frame(0, 1, np.eye(4), np.ones(3)), {})
+    writer.close()
+    info = json.loads((tmp_path / "log.json").read_text(encoding="utf-8"))
+    assert violations(schema("rtmap.log"), info) == []
+    assert set(info) == set(schema("rtmap.log")["properties"])
