@@ -141,6 +141,10 @@ def run(arguments: list[str] | None = None) -> int:
         # The reader of a pipe (head, jq) went away: that is its right.
         sys.stderr.close()
         return 0
+    except OSError as error:
+        where = error.filename or "file system"
+        click.echo(f"rtmap: {where}: {error.strerror or error}; nothing was written", err=True)
+        return 3
 
 
 if __name__ == "__main__":

@@ -41,16 +41,23 @@ def log(message: str) -> None:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
-    """A plain text table: first column to the left, the others to the right."""
-    cells = [list(map(str, header))] + [list(map(str, row)) for row in rows]
+    """A plain text table: columns of numbers to the right, columns of text to the left."""
+    body = [list(map(str, row)) for row in rows]
+    cells = [list(map(str, header)), *body]
     widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
+    numeric = [bool(body) and all(_number(row[k]) for row in body) for k in range(len(header))]
     return [
         "  ".join(
-            cell.ljust(width) if k == 0 else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+            cell.rjust(width) if right else cell.ljust(width)
+            for cell, width, right in zip(row, widths, numeric, strict=True)
         ).rstrip()
         for row in cells
     ]
+
+
+def _number(text: str) -> bool:
+    """True for what stands in a column of numbers: figures, shares, a dash for nothing."""
+    return text.strip("+-−– .,%°/") == "" or text.strip("+-−.,%° /")[:1].isdigit()
 
 
 def progress(
