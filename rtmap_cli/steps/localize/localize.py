@@ -1,0 +1,129 @@
+"""Where the frames of a run stand on a map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.errors import BadInput, NoAnswer, UsageError
+from rtmap_cli.geometry.poses import xyyaw_of
+from rtmap_cli.logs.run import Poses, Run
+from rtmap_cli.maps.crs import check_same_crs
+from rtmap_cli.maps.element import VectorMap
+from rtmap_cli.steps.localize.answer import poses_of
+from rtmap_cli.steps.localize.calibrate import calibrated
+from rtmap_cli.steps.localize.frames import has_matches, read_detections
+from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.model import ErrorModel, Settings
+from rtmap_cli.steps.localize.motion import motion_of
+from rtmap_cli.steps.localize.single import Solution, solve_single
+from rtmap_cli.steps.localize.smooth import solve_smooth
+
+Array = NDArray[np.float64]
+
+METHODS = ("auto", "matches", "geometry", "end-to-end")
+"""How vertices find their lines: by D where the run has it, by D, by geometry; or T^E as it is."""
+
+MAP_MARGIN_M = 60.0
+"""The map is read so far around the initial poses."""
+
+
+def localize(
+    run: Run,
+    vector_map: VectorMap,
+    method: str = "auto",
+    smooth: bool = False,
+    model: ErrorModel | None = None,
+    settings: Settings | None = None,
+    where: str | Path = "map",
+) -> Poses:
+    """Localize every frame of a run on a map (Eq. 4 of the paper; ``smooth``: all frames at once).
+
+    ``method`` is one of METHODS. BadInput when the map has another CRS or lies elsewhere, or when
+    initial poses or sigmas are unusable; NoAnswer when no frame has an answer.
+    """
+    settings = settings or Settings()
+    check_same_crs(vector_map.crs, run.crs, where)
+    _check_frames(run)
+    lines, origin = _lines(run, vector_map, settings, where)
+    if method == "end-to-end":
+        return _end_to_end(run, origin, smooth, settings)
+    if method == "matches" and not has_matches(run):
+        raise UsageError("--method matches: the run has no matched elements; use geometry")
+    matched = method == "matches" or (method == "auto" and has_matches(run))
+    seen = read_detections(run, lines, settings, matched)
+    if not len(seen.frame):
+        raise NoAnswer(f"{run.log_id}: no detection can be compared with the map")
+    start = solve_single(lines, seen, model or ErrorModel(), settings)
+    if model is None:
+        model = calibrated(lines, seen, start, ErrorModel(), settings)
+        start = solve_single(lines, seen, model, settings)
+    name = "matches" if matched else "geometry"
+    if smooth:
+        motion = motion_of(run.frames, seen.pose, model, settings)
+        start = solve_smooth(lines, seen, motion, start, model, settings)
+        name = "smooth"
+    poses = poses_of(run.frames, start, origin, name, model, settings)
+    if (poses.status == "no-match").all():
+        raise NoAnswer(f"{run.log_id}: nothing in any frame matches the map")
+    return poses
+
+
+def bounds(run: Run) -> tuple[float, float, float, float]:
+    """The box of the map frame that can matter to a run (metres)."""
+    xy = run.frames.initial[:, :2, 3]
+    low, high = xy.min(axis=0) - MAP_MARGIN_M, xy.max(axis=0) + MAP_MARGIN_M
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _check_frames(run: Run) -> None:
+    where = run.path / "frames.parquet" if run.path else run.log_id
+    if not len(run.frames):
+        raise BadInput(where, "the run has no frames")
+    bad = ~(np.isfinite(run.frames.sigma) & (run.frames.sigma > 0)).all(axis=1)
+    if bad.any():
+        frame = int(run.frames.frame[bad][0])
+        raise BadInput(where, f"frame {frame}: the sigma of the initial pose is not above zero")
+
+
+def _lines(
+    run: Run, vector_map: VectorMap, settings: Settings, where: str | Path
+) -> tuple[MapLines, Array]:
+    """The lines of the map around a run; BadInput when there are none."""
+    origin = np.round(run.frames.initial[:, :2, 3].mean(axis=0))
+    lines = MapLines(vector_map, list(run.info["classes"]), origin, settings.heading_weight_m)
+    box = bounds(run)
+    if lines.count:
+        xy = lines.xy + origin
+        near = ((xy >= box[:2]) & (xy <= box[2:])).all(axis=1)
+        if near.any():
+            return lines, origin
+    raise BadInput(
+        where,
+        f"no element within {MAP_MARGIN_M:.0f} m of the drive around "
+        f"({origin[0]:.0f}, {origin[1]:.0f})",
+        "check that map and run are of the same place",
+    )
+
+
+def _end_to_end(run: Run, origin: Array, smooth: bool, settings: Settings) -> Poses:
+    """T^E of the network as the answer, for the paper's comparison of T^E and T^R."""
+    if smooth:
+        raise UsageError("--method end-to-end takes T^E as it is and cannot be smoothed")
+    pose, covariance = run.frames.end_to_end.copy(), run.frames.end_to_end_covariance
+    known = np.asarray(np.isfinite(pose).all(1) & np.isfinite(covariance).all((1, 2)))
+    if not known.any():
+        raise NoAnswer(f"{run.log_id}: the run has no end-to-end poses")
+    initial = xyyaw_of(run.frames.initial)
+    pose = np.where(known[:, None], pose, initial)
+    prior = run.frames.sigma[:, :, None] ** 2 * np.eye(3)
+    covariance = np.where(known[:, None, None], covariance, prior)
+    information = np.where(known[:, None, None], np.linalg.inv(covariance), 0.0)
+    pose[:, :2] -= origin
+    count = np.where(known, settings.min_residuals, 0)
+    solution = Solution(pose, covariance, information, np.full(len(pose), np.nan), count)
+    # The network states its own covariance: nothing is added to it.
+    model = ErrorModel(rig_sigma_m=0.0, rig_sigma_rad=0.0)
+    return poses_of(run.frames, solution, origin, "end-to-end", model, settings)

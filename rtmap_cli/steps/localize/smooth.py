@@ -1,0 +1,127 @@
+"""Whole-log MAP: odometry, GNSS with a walking bias, map residuals and a field of place errors."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.poses import wrap_angle
+from rtmap_cli.steps.localize.blocks import BlockSystem
+from rtmap_cli.steps.localize.frames import Detections
+from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.model import ErrorModel, Settings
+from rtmap_cli.steps.localize.motion import STATE, Motion, add_motion
+from rtmap_cli.steps.localize.place import PlaceField
+from rtmap_cli.steps.localize.residuals import judge, linearize, noise_of
+from rtmap_cli.steps.localize.single import Solution
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_CHUNK_FRAMES = 80
+_START_ROUNDS = 6
+# Single-frame answers of one drive share their systematic errors: they count a tenth.
+_START_SHARE = 0.1
+# What of the field's variance is unknown while elements are judged.
+_FIELD_DOUBT = 0.25
+# Frames in which one error of an element or of the map is seen, at most.
+_MOST_REPEATS = 100.0
+
+
+def solve_smooth(
+    lines: MapLines,
+    seen: Detections,
+    motion: Motion,
+    start: Solution,
+    model: ErrorModel,
+    settings: Settings,
+) -> Solution:
+    """Gauss–Newton over all frames; ``start`` are the single-frame answers.
+
+    Errors that several frames share are inflated by the number of frames that see them: an
+    element's own offset over ``element_length_m`` of travel, the map's over ``map_persist_m``.
+    What stays at the place for the whole drive is the field, and is solved for.
+    """
+    pose, bias = _start(motion, start)
+    spacing = motion.spacing[seen.frame]
+    repeats = np.clip(2.0 * model.element_length_m / spacing, 1.0, _MOST_REPEATS)
+    map_repeats = np.clip(model.map_persist_m / spacing, 1.0, _MOST_REPEATS)
+    once = model.element_share + _FIELD_DOUBT * model.place_share
+    chunk = chunks(motion.step, settings.chunk_m)
+    field: PlaceField | None = None
+    for gate in settings.smooth_gates_m:
+        linear = linearize(lines, seen, pose, gate)
+        field = PlaceField(lines, seen, linear, chunk, model, field)
+        plain = noise_of(lines, seen, linear, model, once)
+        rest = linear.r + field.predict()
+        judgement = judge(seen, linear, plain, rest, model, settings.huber)
+        noise = noise_of(lines, seen, linear, model, model.element_share * repeats, map_repeats)
+        weight = judgement.weight(noise)
+        system = BlockSystem(field.sizes)
+        information, chi2 = field.add(system, weight, noise.shared)
+        index = field.frame_index
+        add_motion(system, index, motion, pose, bias)
+        system.factor()
+        step = system.solve()
+        pose = pose + step[index[:, None] + np.arange(3)]
+        bias = bias + step[index[:, None] + np.arange(3, STATE)]
+        field.update(step)
+    used = seen.sum_by_frame(((weight > 0) & (judgement.inlier[:, None] > 0.5)).sum(-1))
+    covariance = _pose_blocks(system, chunk, index)
+    return Solution(pose, covariance, information, chi2, used.astype(np.int64))
+
+
+def chunks(step: Array, length_m: float) -> Index:
+    """(T,) chunk of each frame: ``length_m`` of travel, or many frames of a vehicle that waits."""
+    out = np.zeros(len(step), np.int64)
+    travelled, count = 0.0, 0
+    for t in range(1, len(step)):
+        travelled += step[t]
+        count += 1
+        out[t] = out[t - 1]
+        if travelled > length_m or count >= _CHUNK_FRAMES:
+            out[t] += 1
+            travelled, count = 0.0, 0
+    return out
+
+
+def _pose_blocks(system: BlockSystem, chunk: Index, index: Index) -> Array:
+    """(T, 3, 3) marginal covariances of the poses."""
+    blocks = system.marginals()
+    out = np.empty((len(chunk), 3, 3))
+    for t, b in enumerate(chunk):
+        k = index[t] - system.offset[b]
+        out[t] = blocks[b][k : k + 3, k : k + 3]
+    return out
+
+
+def _start(motion: Motion, single: Solution) -> tuple[Array, Array]:
+    """Poses and biases from GNSS, odometry and single-frame answers, with robust weights.
+
+    A frame that fell for the next lane disagrees with its neighbours and loses its vote.
+    """
+    frames = len(motion.gnss)
+    pose, bias = motion.gnss.copy(), np.zeros((frames, 3))
+    chunk = np.arange(frames) // _CHUNK_FRAMES
+    sizes = [int(n) * STATE for n in np.bincount(chunk)]
+    index = STATE * np.arange(frames)
+    information = np.linalg.inv(single.covariance)
+    information[single.residuals == 0] = 0.0
+    trust = np.ones(frames)
+    for _ in range(_START_ROUNDS):
+        system = BlockSystem(sizes)
+        add_motion(system, index, motion, pose, bias)
+        d = pose - single.pose
+        d[:, 2] = wrap_angle(d[:, 2])
+        pull = (information @ d[..., None])[..., 0]
+        for t in np.flatnonzero(single.residuals > 0):
+            share = _START_SHARE * trust[t]
+            system.add(index[t] + np.arange(3), share * information[t], share * pull[t])
+        system.factor()
+        step = system.solve().reshape(frames, STATE)
+        pose, bias = pose + step[:, :3], bias + step[:, 3:]
+        d = pose - single.pose
+        d[:, 2] = wrap_angle(d[:, 2])
+        # Cauchy weights: a frame six sigmas (three degrees of freedom) off has half a vote.
+        trust = 1.0 / (1.0 + np.einsum("ti,tij,tj->t", d, information, d) / 6.0)
+    return pose, bias
