@@ -17,6 +17,7 @@ cv2 = pytest.importorskip("cv2", reason="opencv is not installed (extra: train)"
 import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
 from rtmap_models.bev import normalize_picture  # noqa: E402
+from rtmap_models.calibrate import calibrate  # noqa: E402
 from rtmap_models.checkpoint import load_checkpoint, load_network  # noqa: E402
 from rtmap_models.config import CONFIGS, load_config  # noqa: E402
 from rtmap_models.criterion import LossWeights, compute_losses  # noqa: E402
@@ -236,3 +237,31 @@ def test_zoo_needs_no_torch() -> None:
 
     with pytest.raises(FileNotFoundError, match="no model named"):
         zoo.model_path("no-such-model")
+
+
+def test_train_renders_its_own_frames(rtmap, tiny: Path, tmp_path: Path) -> None:
+    call = ("--config", tiny, "--seed", 3, "--threads", 1, "--batch", 2, "-q")
+    rtmap("train", "-o", tmp_path / "a.pt", "--frames", 2, *call)
+    assert not (tmp_path / "a.pt").exists()
+    first = {p.name: p.read_bytes() for p in (tmp_path / "frames").iterdir()}
+    assert len(first) == 3
+    rtmap("train", "-o", tmp_path / "a.pt", "--frames", 2, "--steps", 2, *call)
+    assert {p.name: p.read_bytes() for p in (tmp_path / "frames").iterdir()} == first
+    again = ("--data", tmp_path / "again", "--frames", 2, "--steps", 1)
+    rtmap("train", "-o", tmp_path / "b.pt", *again, *call)
+    for name, content in first.items():
+        if not name.endswith(".npz"):  # archives carry the time of writing
+            assert (tmp_path / "again" / name).read_bytes() == content
+    rtmap("train", "-o", tmp_path / "b.pt", "--steps", 1, *call, code=2)
+
+
+def test_calibration_makes_sigmas_honest(weights: Path, frames: Path) -> None:
+    network, _ = load_network(weights)
+    before = calibrate(network, Frames(frames, network.config))
+    with torch.no_grad():
+        for layer in network.decoder.layers:
+            layer.move.bias[2:] += 0.5  # every scale is now e^0.5 times larger
+    after = calibrate(network, Frames(frames, network.config))
+    for name, value in before.items():
+        if name.startswith("sigma") and value not in (0.2, 5.0, 1.0):
+            assert after[name] == pytest.approx(value * np.exp(-0.5), rel=0.1)
