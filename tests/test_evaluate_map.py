@@ -429,6 +429,29 @@ def test_frames_that_do_not_correspond(rtmap: Any, tmp_path: Path) -> None:
     assert "is no run" in rtmap("evaluate", "map", empty, "--truth", truth, code=3).err
 
 
+def test_missing_frames_count_as_empty(rtmap: Any, tmp_path: Path) -> None:
+    pred = save(tmp_path / "pred.json", frames_json(True))
+    value = frames_json(False)
+    value["frames"]["drive_2000000000"] = value["frames"]["drive_1000000000"]
+    truth = save(tmp_path / "truth.json", value)
+    result = rtmap("evaluate", "map", pred, "--truth", truth, "--json")
+    assert json.loads(result.out)["classes"]["divider"]["ap"]["0.5"] == 0.5
+    assert "lacks 1 frames" in result.err
+
+
+def test_fleet_benchmark_runs(
+    rtmap_golden: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import runpy
+
+    script = Path(__file__).parents[1] / "benchmarks" / "fleet.py"
+    words = f"frames --golden {rtmap_golden} --maps 7fab2350 --scenarios straight --drives 1"
+    monkeypatch.setattr("sys.argv", [str(script), *words.split()])
+    runpy.run_path(str(script), run_name="__main__")
+    row = next(r for r in capsys.readouterr().out.splitlines() if "7fab2350/straight" in r)
+    assert 10 < float(row.split()[-1]) < 60
+
+
 def test_limits(rtmap: Any, tmp_path: Path) -> None:
     pred = save(tmp_path / "pred.json", frames_json(True))
     truth = save(tmp_path / "truth.json", frames_json(False))

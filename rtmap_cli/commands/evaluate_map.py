@@ -77,7 +77,7 @@ def command(
       rtmap evaluate map runs/drive-00 --truth town --poses logs/drive-00
     """
     from rtmap_cli.output import emit, log
-    from rtmap_cli.steps.evaluate.compare import Settings, compare, read_side
+    from rtmap_cli.steps.evaluate.compare import Settings, compare, missing_frames, read_side
     from rtmap_cli.steps.evaluate.drives import read_drives
     from rtmap_cli.steps.evaluate.limits import check_limits, check_names, parse_limits
 
@@ -91,17 +91,16 @@ def command(
         every=every,
         cell=cells,
     )
-    score = compare(
-        read_side(pred, True, drives, map_version),
-        read_side(truth, False, drives),
-        drives,
-        settings,
-    )
+    sides = read_side(pred, True, drives, map_version), read_side(truth, False, drives)
+    score = compare(*sides, drives, settings)
     figures = {"mAP": score.mAP} | {f"AP.{name}": c.mean for name, c in score.classes.items()}
     check_names(limits, list(figures))
     if score.without_truth:
         names = ", ".join(score.without_truth)
         log(f"rtmap: no true element of {names}: its AP is 0 by the protocol's rule")
+    lacking = missing_frames(*sides)
+    if lacking:
+        log(f"rtmap: {pred} lacks {lacking} frames of {truth}: they count as empty")
     emit(score.as_json(), as_json, _lines(score))
     check_limits(limits, dict(figures))
 

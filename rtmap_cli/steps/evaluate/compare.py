@@ -103,6 +103,13 @@ def compare(
     return scorer.result()
 
 
+def missing_frames(pred: Side, truth: Side) -> int:
+    """Frames of the truth that a prediction by frames says nothing about: they count as empty."""
+    if isinstance(pred, FrameSet) and isinstance(truth, FrameSet):
+        return len(truth.frames) - len(pred.frames)
+    return 0
+
+
 def _classes(pred: Side, truth: Side, s: Settings) -> list[str]:
     if s.classes:
         return list(s.classes)
