@@ -18,7 +18,7 @@ from rtmap_cli.logs.log import Camera, Occluder
 from rtmap_cli.steps.simulate.render_boxes import draw_boxes, scene_boxes
 from rtmap_cli.steps.simulate.style import Style
 from rtmap_cli.steps.simulate.world import World
-from rtmap_cli.steps.simulate.world_ground import LEVELS, ground_window, noise_fields, opencv
+from rtmap_cli.steps.simulate.world_ground import ground_window, noise_fields, opencv
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -27,8 +27,11 @@ Image = NDArray[np.uint8]
 HORIZON = 1e-3
 """Slope of a ray below which it meets no ground (1.6 km away)."""
 
-HALF_WIDTHS = (20.0, 40.0, 72.0, 128.0)
-"""Half widths (m) of the ground windows of the levels at a base resolution of 0.125 m."""
+HALF_WIDTHS = {
+    0.125: (20.0, 40.0, 72.0, 128.0),
+    0.0625: (16.0, 24.0, 40.0, 72.0, 128.0),
+}
+"""Half widths (m) of the ground windows, finest level first, by base resolution (m)."""
 
 
 def render_cameras(
@@ -52,10 +55,8 @@ def render_cameras(
     body = _body_motion(style, rng)
     x, y, yaw = xyyaw_of(map_SE3_ego)
     base = base_resolution(cameras)
-    reach = base / 0.125
     windows = [
-        ground_window(world, x, y, max(20.0, HALF_WIDTHS[k] * reach), k, base)
-        for k in range(LEVELS)
+        ground_window(world, x, y, half, k, base) for k, half in enumerate(HALF_WIDTHS[base])
     ]
     palette = _palette(style)
     boxes = scene_boxes(world, map_SE3_ego, occluders, style, ground_z)
@@ -212,11 +213,11 @@ def _sample(
     middle = depth[::rows, depth.shape[1] // 2]
     # Geometric mean of the footprint across (s / f) and along the view (s² / (f·h)).
     footprint = middle / focal * np.sqrt(np.maximum(1.0, middle / rise / rows))
-    wanted = np.clip(np.round(np.log2(np.maximum(footprint / base, 1e-3))), 0, LEVELS - 1)
+    wanted = np.clip(np.round(np.log2(np.maximum(footprint / base, 1e-3))), 0, len(windows) - 1)
     reach = np.maximum(np.abs(mx), np.abs(my)).reshape(count, -1)
     near = np.minimum(np.percentile(reach[:, ::8], 90, axis=1), 1e6)
     level = wanted.astype(np.int64)
-    for k in range(LEVELS - 1):
+    for k in range(len(windows) - 1):
         half = windows[k][0].shape[0] * base * 2**k / 2 - 1.0
         level[(near > half) & (level <= k)] = k + 1
     out = [np.empty((count, mx.shape[1], 4), np.float32) for _ in range(2)]

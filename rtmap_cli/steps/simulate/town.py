@@ -165,11 +165,10 @@ def _crossings(
                 continue
             arm.stop = gap + depth + rng.uniform(0.8, 2.0)
             left, right = street.profile.half_width(0), -street.profile.half_width(1)
-            sides = ((0.0, left, gap), (1.0, right, gap), (1.0, right, gap + depth))
-            quad = [
-                street.at(arm.station(k, d), o) for k, o, d in (*sides, (0.0, left, gap + depth))
-            ]
-            out.append((np.array([*quad, quad[0]]), pattern))
+            far = gap + depth
+            corners = ((0.0, left, gap), (1.0, right, gap), (1.0, right, far), (0.0, left, far))
+            ring = [street.at(arm.station(k, d), o) for k, o, d in corners]
+            out.append((np.array([*ring, ring[0]]), pattern))
     for index, street in enumerate(streets):
         if rng.random() < 0.35 * street.profile.crossings:
             quad = _midblock(rng, street, index, junctions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,7 +50,7 @@ def _pieces(index: int, street: Street, junctions: list[Junction]) -> list[Lane]
     stops.sort()
     cuts = [(-1.0, 0.0, -1), *stops, (street.length, street.length + 1, -1)]
     out: list[Lane] = []
-    for (_, start, leaves), (end, _, enters) in zip(cuts, cuts[1:], strict=False):
+    for (_, start, leaves), (end, _, enters) in pairwise(cuts):
         if end - start < 4:
             continue
         for offset, direction in street.profile.lane_offsets():

@@ -97,6 +97,13 @@ def _rings(vector_map: VectorMap) -> tuple[list[Array], list[Array], list[Array]
     return rings, curbs, gaps
 
 
+def even_odd_surface(vector_map: VectorMap) -> Any:
+    """The asphalt of a map as a shapely geometry; see ``world_from_map``."""
+    surface = _even_odd(_rings(vector_map)[0])
+    shapely.prepare(surface)
+    return surface
+
+
 def _even_odd(rings: list[Array]) -> Any:
     """Area inside an odd number of rings."""
     area: Any = shapely.Polygon()

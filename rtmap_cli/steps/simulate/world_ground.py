@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 TILE = 256
-LEVELS = 4
+MAX_TILES = 800
+"""Tiles kept per world (0.5 MB each); the oldest are dropped."""
 NOISE_SIZE = 1024
 SUBPIXEL = 4
 """Fractional bits of the drawing coordinates."""
@@ -108,6 +109,8 @@ def ground_window(
             key = (step, ti, tj)
             tile = world.tiles.get(key)
             if tile is None:
+                if len(world.tiles) >= MAX_TILES:
+                    del world.tiles[next(iter(world.tiles))]
                 tile = world.tiles[key] = draw_tile(world, ti * side, tj * side, step, level)
             a0, a1 = max(i0, ti * TILE), min(i1, (ti + 1) * TILE)
             b0, b1 = max(j0, tj * TILE), min(j1, (tj + 1) * TILE)
@@ -154,7 +157,8 @@ def draw_tile(world: World, x0: float, y0: float, step: float, level: int) -> Im
     layers = [asphalt, outer, curb, white, yellow]
     if fine > 1:
         layers = [cv2.resize(m, (TILE, TILE), interpolation=cv2.INTER_AREA) for m in layers]
-    return _mix(layout, x0, y0, step, *(m.astype(np.float32) / 255 for m in layers))
+    shares = [m.astype(np.float32) / np.float32(255) for m in layers]
+    return _mix(layout, x0, y0, step, shares)
 
 
 def _rings_of(area: Any) -> list[Array]:
@@ -217,13 +221,13 @@ def _mix(
     x0: float,
     y0: float,
     step: float,
-    asphalt: NDArray[np.float32],
-    outer: NDArray[np.float32],
-    curb: NDArray[np.float32],
-    white: NDArray[np.float32],
-    yellow: NDArray[np.float32],
+    drawn: list[NDArray[np.float32]],
 ) -> Image:
-    """Shares of the materials (they add up to at most one) and texture, as uint8 layers."""
+    """Shares of the materials (they add up to at most one) and texture, as uint8 layers.
+
+    ``drawn``: coverage of asphalt, asphalt with sidewalk, curb, white and yellow paint in [0, 1].
+    """
+    asphalt, outer, curb, white, yellow = drawn
     ox, oy = layout["offset"]
 
     def noise(field: int, unit: float) -> NDArray[np.float32]:
