@@ -80,6 +80,11 @@ class Change:
         return out
 
 
+def truth_json(changes: Sequence[Change], crs: str) -> dict[str, Any]:
+    """The truth file: ``{"crs", "changes": […]}``, kinds seen from the outdated map."""
+    return {"crs": crs, "changes": [c.as_json(crs) for c in changes]}
+
+
 def parse_spec(text: str) -> ChangeSpec:
     """``delete:ped_crossing``, ``insert:divider*2``, ``move:divider``; UsageError otherwise."""
     found = re.fullmatch(r"(\w+):(\w+)(?:\*(\d+))?", text.strip())

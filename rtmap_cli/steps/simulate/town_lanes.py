@@ -42,10 +42,10 @@ def _pieces(index: int, street: Street, junctions: list[Junction]) -> list[Lane]
         if not own:
             continue
         middle = float(shapely.linestrings(street.line).project(shapely.points(junction.place)))
-        low, high = middle, middle
+        low = high = middle
         for arm in own:
             edge = np.mean(arm.clear) + arm.direction * max(arm.stop, 1.0)
-            low, high = min(low, edge), max(high, edge)
+            low, high = min(low, float(edge)), max(high, float(edge))
         stops.append((float(low), float(high), k))
     stops.sort()
     cuts = [(-1.0, 0.0, -1), *stops, (street.length, street.length + 1, -1)]

@@ -1,0 +1,100 @@
+"""``rtmap simulate changes``: change a map, with a truth file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from rtmap_cli import options
+from rtmap_cli.output import emit
+
+
+@click.command("changes")
+@options.map_path
+@options.map_version
+@click.option(
+    "--change", "specs", multiple=True, required=True,
+    help="KIND:CLASS or KIND:CLASS*COUNT; delete, insert, move (divider). Repeat it.",
+)  # fmt: skip
+@click.option("--near", help="Only near this drive: av2:LOG_DIR, LOG or town:.")
+@click.option("--drive", type=click.IntRange(0), default=0, show_default=True,
+              help="Number of the drive through the town.")  # fmt: skip
+@click.option("--route", type=click.Choice(["straight", "turning"]), default="turning",
+              show_default=True, help="Kind of the drive through the town.")  # fmt: skip
+@click.option("--length", type=click.FloatRange(20), default=160.0, show_default=True,
+              help="Length of the drive through the town (m).")  # fmt: skip
+@click.option("--world-seed", type=int, default=0, show_default=True,
+              help="Seed of the corridor of the town's drives.")  # fmt: skip
+@click.option(
+    "--outdate",
+    is_flag=True,
+    help="MAP is the world; write the outdated map that lacks the changes.",
+)
+@options.seed
+@click.option("--truth", type=options.PATH, help="File for the true changes (prior → world).")
+@options.output("The map folder to write.")
+@options.overwrite
+@options.as_json
+def command(
+    map_path: Path,
+    map_version: int | None,
+    specs: tuple[str, ...],
+    near: str | None,
+    drive: int,
+    route: str,
+    length: float,
+    world_seed: int,
+    outdate: bool,
+    seed: int,
+    truth: Path | None,
+    output: Path,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Delete, insert or move elements of MAP; the result is another map.
+
+    Changes are named as a fleet sees them, from the outdated map to the world: MAP is the outdated
+    map and the output the world, or with --outdate the other way round.
+
+    \b
+    Example:
+      rtmap simulate changes --map town --change delete:ped_crossing --change insert:divider \\
+          --near town: --outdate --seed 1 -o prior --truth truth.json
+    """  # fmt: skip
+    import numpy as np
+
+    from rtmap_cli.errors import BadInput
+    from rtmap_cli.maps.store import read_map, write_new_map
+    from rtmap_cli.steps.simulate.changes import change_world, parse_spec, truth_json
+    from rtmap_cli.steps.simulate.drive_source import Route, find_source, town_info
+    from rtmap_cli.steps.simulate.perception import DriveKey
+    from rtmap_cli.tables import write_json
+
+    wanted = [parse_spec(text) for text in specs]
+    if truth is not None and truth.exists() and not overwrite:
+        raise BadInput(truth, "exists already", "choose another --truth or pass --overwrite")
+    old = read_map(map_path, map_version)
+    path = None
+    if near is not None:
+        key = DriveKey(world_seed, 0, drive)
+        source = find_source(near, map_path, old, key, Route(route, length, 2.5))
+        path = source.drive.pose[:, :2, 3]
+    rng = np.random.default_rng([seed, 61])
+    made = [s.inverse() for s in wanted] if outdate else wanted
+    new, changes = change_world(old, made, rng, path)
+    if outdate:
+        changes = [c.flipped() for c in changes]
+    known = town_info(map_path)
+    info = {"changes": list(specs), "seed": seed, "outdated": outdate}
+    if "town" in known:
+        info["town"] = known["town"]
+    write_new_map(new, output, f"simulated changes: {', '.join(specs)}", overwrite, info=info)
+    told = truth_json(changes, old.crs)
+    if truth is not None:
+        write_json(told, truth)
+    lines = [
+        f"{c['kind']} {c['class']} {c['element_id']}, {c['length_m']:.1f} m"
+        for c in told["changes"]
+    ]
+    emit({"map": str(output), "truth": str(truth) if truth else None} | told, as_json, lines)

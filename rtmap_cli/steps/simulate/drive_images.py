@@ -1,0 +1,93 @@
+"""The frames and pictures of a drive, one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rtmap_cli.logs.log import Frame, Rig
+from rtmap_cli.logs.run import Poses
+from rtmap_cli.steps.simulate.drive import lane_traffic
+from rtmap_cli.steps.simulate.drives import Drive, initial_poses, with_traffic
+from rtmap_cli.steps.simulate.noise import generator
+from rtmap_cli.steps.simulate.perception import DriveKey
+from rtmap_cli.steps.simulate.presets import Preset
+from rtmap_cli.steps.simulate.render import render_cameras
+from rtmap_cli.steps.simulate.style import make_style
+from rtmap_cli.steps.simulate.world import World
+from rtmap_cli.steps.simulate.world_ground import opencv
+
+if TYPE_CHECKING:
+    from rtmap_cli.steps.simulate.drive_source import Source
+
+
+def with_vehicles(
+    path: Drive, source: Source, surface: Any, key: DriveKey, traffic: str | None
+) -> Drive:
+    """The drive with the vehicles that ``traffic`` asks for: log, generated or none.
+
+    None: the log's boxes, generated ones where it has none. Generated vehicles follow the lanes of
+    a town; along a log, whose lanes are unknown, they keep beside its path.
+    """
+    if traffic == "none":
+        return replace(path, occluders=[()] * len(path))
+    if traffic == "log" or (traffic is None and path.occluders is not None):
+        return path
+    if source.lanes is not None:
+        return lane_traffic(path, source.lanes, surface, key)
+    path = with_traffic(path, Preset(), key)
+    lifted = [tuple(replace(o, z=source.ground_z) for o in b) for b in path.occluders or []]
+    return replace(path, occluders=lifted)
+
+
+def frames_of(path: Drive, key: DriveKey) -> Iterator[Frame]:
+    """What the vehicle knows: rough poses with their sigmas, odometry, boxes."""
+    known = initial_poses(path, Preset(), key)
+    for k in range(len(path)):
+        measured = bool(np.isfinite(known.odometry[k]).all())
+        yield Frame(
+            index=k,
+            timestamp_ns=int(path.timestamp_ns[k]),
+            map_SE3_ego=known.initial[k],
+            sigma=known.sigma[k],
+            odometry=known.odometry[k] if measured else None,
+            odometry_sigma=known.odometry_sigma[k] if measured else None,
+            occluders=path.occluders[k] if path.occluders else (),
+        )
+
+
+def images_of(
+    world: World, path: Drive, rig: Rig, ground_z: float, key: DriveKey, quality: int
+) -> Iterator[dict[str, bytes]]:
+    """JPEG files of every frame by camera name; weather belongs to the drive."""
+    cv2 = opencv()
+    style = make_style(generator(*key.drive, "style"))
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    for k, pose in enumerate(path.pose):
+        boxes = path.occluders[k] if path.occluders else ()
+        rng = generator(*key.drive, "camera", k)
+        images = render_cameras(world, pose, rig.cameras, style, boxes, rng, ground_z)
+        yield {
+            camera.name: cv2.imencode(".jpg", image[..., ::-1], parameters)[1].tobytes()
+            for camera, image in zip(rig, images, strict=True)
+        }
+
+
+def poses_of(path: Drive) -> Poses:
+    """The true poses as a table of method ``truth`` with zero covariance."""
+    n = len(path)
+    return Poses(
+        frame=np.arange(n, dtype=np.int32),
+        timestamp_ns=path.timestamp_ns,
+        method="truth",
+        pose=path.pose,
+        covariance=np.zeros((n, 6, 6)),
+        eigenvalues=np.full((n, 3), np.nan),
+        weakest_direction=np.full((n, 3), np.nan),
+        residual_count=np.zeros(n, np.int32),
+        chi2=np.zeros(n),
+        status=np.full(n, "ok", dtype=object),
+    )
