@@ -27,8 +27,8 @@ Int = NDArray[np.int64]
 
 LIMIT = 12.0
 """Log-odds are kept within ± this: no map is so sure that it cannot learn."""
-PRIOR_LOG_ODDS = 3.0
-"""Log-odds of an element of a prior map that states none (19 of 20 are there)."""
+PRIOR_LOG_ODDS = 2.5
+"""Log-odds of an element of a prior map that states none (12 of 13 are there)."""
 
 
 @dataclass(frozen=True)
@@ -36,20 +36,22 @@ class VoteModel:
     """Parameters of the two models; all shares and rates are probabilities.
 
     ``found``: usual hit rate per view; ``hard``: share of places that are hard to see, found at
-    ``hard_rate`` × found; ``false_rate``: hits per view where nothing is; ``ghost``: share of the
+    ``hard_rate`` × found; ``false_rate``: hits per view where nothing is, ``picked_rate``: the
+    same at places that were picked because something was found there; ``ghost``: share of the
     drives in which a false detection stays in place, seen at ``ghost_rate`` × found;
     ``strength``: how alike the frames of a drive are (beta-binomial pseudo-count, lower = more
     alike); ``most_views``: frames beyond which a drive's vote does not grow.
     """
 
     found: float = 0.6
-    hard: float = 0.12
+    hard: float = 0.10
     hard_rate: float = 0.35
-    false_rate: float = 0.04
+    false_rate: float = 0.02
+    picked_rate: float = 0.06
     ghost: float = 0.05
     ghost_rate: float = 0.4
-    strength: float = 4.0
-    most_views: float = 8.0
+    strength: float = 8.0
+    most_views: float = 12.0
 
     def with_found(self, found: float) -> VoteModel:
         """The same model with another usual hit rate."""
@@ -58,7 +60,7 @@ class VoteModel:
         return replace(self, found=float(np.clip(found, 0.25, 0.95)))
 
 
-def _log_beta_binomial(hits: Array, misses: Array, rate: float, strength: float) -> Array:
+def _log_beta_binomial(hits: Array, misses: Array, rate: Array | float, strength: float) -> Array:
     """log of B(a + hits, b + misses) / B(a, b); fractional counts are allowed."""
     from scipy.special import betaln
 
@@ -67,10 +69,13 @@ def _log_beta_binomial(hits: Array, misses: Array, rate: float, strength: float)
     return out
 
 
-def drive_log_likelihoods(hits: Array, views: Array, model: VoteModel) -> Array:
+def drive_log_likelihoods(
+    hits: Array, views: Array, model: VoteModel, picked: NDArray[np.bool_] | bool = False
+) -> Array:
     """(3, ...) log-likelihoods of one drive's counts: exists and easy, exists and hard, absent.
 
-    Without a view all three are 0: never looked is no evidence.
+    ``picked`` marks places that are there because something was found. Without a view all three
+    are 0: never looked is no evidence.
     """
     views = np.maximum(views, 0.0)
     rate = np.clip(np.where(views > 0, hits / np.maximum(views, 1e-9), 0.0), 0.0, 1.0)
@@ -80,7 +85,8 @@ def drive_log_likelihoods(hits: Array, views: Array, model: VoteModel) -> Array:
     s = model.strength
     easy = _log_beta_binomial(h, m, model.found, s)
     hard = _log_beta_binomial(h, m, model.hard_rate * model.found, s)
-    false = _log_beta_binomial(h, m, model.false_rate, s)
+    rate_if_absent = np.where(picked, model.picked_rate, model.false_rate)
+    false = _log_beta_binomial(h, m, rate_if_absent, s)
     ghost = _log_beta_binomial(h, m, model.ghost_rate * model.found, s)
     absent = np.logaddexp(np.log1p(-model.ghost) + false, np.log(model.ghost) + ghost)
     return np.stack([easy, hard, absent])

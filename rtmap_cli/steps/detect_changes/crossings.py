@@ -8,10 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.rings import align, open_ring, overlap, polygon
+from rtmap_cli.geometry.rings import RING_POINTS, align, open_ring, overlap, polygon
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.visibility import Views, views
-from rtmap_cli.steps.detect_changes.votes import DriveCounts, count, view_weight
+from rtmap_cli.steps.detect_changes.votes import (
+    DriveCounts,
+    answer_value,
+    count,
+    detection_value,
+    view_weight,
+)
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -41,16 +47,17 @@ class Rings:
 
 
 def features(rings: Array) -> Array:
-    """(n, 4) centre and direction of rings (n, k, 2): x, y and up to 3 m · (cos 2θ, sin 2θ).
+    """(n, 4) centre and direction of rings (n, k, 2): x, y and up to 1.5 m · (cos 2θ, sin 2θ).
 
-    The direction of the longer axis counts as far as the ring is longer than wide.
+    The direction of the longer axis counts as far as the ring is longer than wide; it is noisy
+    for small rings, and neighbours at a corner are told apart by their centres.
     """
     centre = rings.mean(axis=1)
     d = rings - centre[:, None]
     xx, yy = (d[..., 0] ** 2).mean(1), (d[..., 1] ** 2).mean(1)
     xy = (d[..., 0] * d[..., 1]).mean(1)
     long = np.hypot((xx - yy) / 2, xy)
-    share = 3.0 * long / np.maximum((xx + yy) / 2, 1e-9)
+    share = 1.5 * long / np.maximum((xx + yy) / 2, 1e-9)
     angle = np.arctan2(2 * xy, xx - yy)
     return np.column_stack([centre, share * np.cos(angle), share * np.sin(angle)])
 
@@ -58,7 +65,8 @@ def features(rings: Array) -> Array:
 def class_rings(traversal: Traversal, class_name: str) -> Rings:
     """A drive's detections of a closed class in the map frame."""
     index = np.flatnonzero(traversal.class_name == class_name)
-    points = np.array([open_ring(p) for p in traversal.points[index]]).reshape(len(index), -1, 2)
+    rings = [open_ring(p) for p in traversal.points[index]]
+    points = np.array(rings).reshape(len(index), RING_POINTS, 2)
     variance = traversal.covariance[index]
     return Rings(
         points,
@@ -104,31 +112,38 @@ def new_rings(prior: Array, drives: Sequence[Rings], least: float = 0.8) -> Arra
     """(m, 80, 2) mean rings of detections that no prior ring explains; not yet judged.
 
     Greedy clusters by support (Σ score of the neighbours), then means with reassignment, twice.
-    Clusters with a summed score below ``least`` are noise.
+    Clusters with a summed score below ``least`` are noise. Detections cut by the range come
+    second: they speak for crossings that are longer than the range and never seen whole.
     """
-    loose = [match(r, prior) < 0 for r in drives]
-    keep = [m & ~r.cut for m, r in zip(loose, drives, strict=True)]
-    if not any(k.any() for k in keep):
-        # Crossings longer than the range is wide are always cut: better a piece than nothing.
-        keep = loose
-    points = np.concatenate([r.points[k] for r, k in zip(drives, keep, strict=True)])
-    if not len(points):
-        return np.zeros((0, *prior.shape[1:]))
-    feature = np.concatenate([r.feature[k] for r, k in zip(drives, keep, strict=True)])
-    score = np.concatenate([r.score[k] for r, k in zip(drives, keep, strict=True)])
-    variance = np.concatenate([r.variance[k] for r, k in zip(drives, keep, strict=True)])
-    weight = score / np.maximum(variance, 0.01)
-    places = _clusters(feature, score, least)
-    means = np.array([_mean(points[p], weight[p]) for p in places]).reshape(-1, *points.shape[1:])
-    for _ in range(2):
-        if not len(means):
+    found = prior[:0]
+    for cut in (False, True):
+        known = np.concatenate([prior, found])
+        keep = [(match(r, known) < 0) & (r.cut == cut) for r in drives]
+        parts = [
+            (r.points[k], r.feature[k], r.score[k], r.variance[k])
+            for r, k in zip(drives, keep, strict=True)
+        ]
+        points, feature, score, variance = (np.concatenate(p) for p in zip(*parts, strict=True))
+        if len(points):
+            weight = score / np.maximum(variance, 0.01)
+            found = np.concatenate([found, _means(points, feature, score, weight, least)])
+    return found
+
+
+def _means(points: Array, feature: Array, score: Array, weight: Array, least: float) -> Array:
+    """Mean rings of the clusters, twice reassigned to the nearest one."""
+    groups = _clusters(feature, score, least)
+    means = points[:0]
+    for k in range(3):
+        means = np.array([_mean(points[g], weight[g]) for g in groups]).reshape(
+            -1, *points.shape[1:]
+        )
+        if not len(means) or k == 2:
             break
         means = _apart(means)
         distance, owner = _nearest(features(means), feature)
-        groups = [np.flatnonzero((owner == k) & (distance <= NEAR)) for k in range(len(means))]
+        groups = [np.flatnonzero((owner == i) & (distance <= NEAR)) for i in range(len(means))]
         groups = [g for g in groups if len(g) and score[g].sum() >= least]
-        means = np.array([_mean(points[g], weight[g]) for g in groups])
-        means = means.reshape(-1, *points.shape[1:])
     return means
 
 
@@ -218,6 +233,8 @@ def ring_counts(
         key = np.concatenate(
             [rings.frame[hit] * n + owner[hit], (asked.frame * n + known)[known >= 0]]
         )
-        value = np.concatenate([rings.score[hit], asked.existence[known >= 0]])
+        value = np.concatenate(
+            [detection_value(rings.score[hit]), answer_value(asked.existence[known >= 0])]
+        )
         counts.append(count(n, traversal, seen, weight, key, value))
     return counts

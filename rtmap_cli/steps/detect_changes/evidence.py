@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import is_ring, length
-from rtmap_cli.geometry.rings import close, open_ring
+from rtmap_cli.geometry.rings import RING_POINTS, close, open_ring
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
 from rtmap_cli.maps.evidence import Counts, Evidence, Policy, Settings, Stretch
@@ -25,6 +25,7 @@ from rtmap_cli.steps.detect_changes.lines import (
     all_line_counts,
     class_samples,
     fused_offsets,
+    joined_lines,
     new_lines,
     refit_lines,
 )
@@ -98,6 +99,7 @@ def _lines(
             break
         # What is left of the candidates competes once more, without those that were refuted.
         found = _supported(found, len(old), stations, votes, policy)
+        found = joined_lines(found, name)
     out = [_line_evidence(e, k, stations, votes, settings) for k, e in enumerate(prior)]
     _add_offsets(out, stations, traversals, samples, fresh, settings)
     for k, line in enumerate(found):
@@ -263,8 +265,8 @@ def _rings(
     settings: Settings,
 ) -> list[Evidence]:
     drives = [class_rings(t, name) for t in traversals]
-    old = np.array([open_ring(e.xy) for e in prior]).reshape(-1, 80, 2)
-    found = new_rings(old, drives).reshape(-1, 80, 2)
+    old = np.array([open_ring(e.xy) for e in prior]).reshape(-1, RING_POINTS, 2)
+    found = new_rings(old, drives)
     places = np.concatenate([old, found])
     if not len(places):
         return []

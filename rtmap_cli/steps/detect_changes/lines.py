@@ -43,8 +43,9 @@ BLUR = {"boundary": 1.0}
 USUAL_BLUR = 0.45
 HIGH, LOW = 0.20, 0.06
 """Ridges start and end at these shares of the height that a steady line would have."""
-JOIN_GAP, JOIN_ANGLE = 6.0, float(np.radians(25))
-"""Ends of new lines that look at each other are joined over such a gap (m)."""
+JOIN_GAP = {"boundary": 12.0}
+USUAL_GAP, JOIN_ANGLE = 7.0, float(np.radians(25))
+"""Ends of new lines that look at each other are joined over such a gap (m): boundaries go on."""
 CORNER = {"boundary": 5.0}
 """Longest extension (m) of two ends to a common corner."""
 
@@ -89,8 +90,13 @@ def new_lines(
     points = _all_ridge_points(drives, traversals, blur, LOW * steady)
     if points is None:
         return []
-    lines = trace(points, HIGH * steady, SHORTEST)
-    return join_collinear(lines, JOIN_GAP, JOIN_ANGLE, CORNER.get(class_name, 0.0))
+    return joined_lines(trace(points, HIGH * steady, SHORTEST), class_name)
+
+
+def joined_lines(lines: list[Array], class_name: str) -> list[Array]:
+    """Lines whose ends look at each other, or meet at a corner, made one."""
+    gap = JOIN_GAP.get(class_name, USUAL_GAP)
+    return join_collinear(lines, gap, JOIN_ANGLE, CORNER.get(class_name, 0.0))
 
 
 def _all_ridge_points(

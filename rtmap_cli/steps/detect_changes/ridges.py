@@ -135,7 +135,7 @@ def _walk(
         cost = np.where(ok, forward + 2 * beside + (1 - turn), np.inf)
         nearest = int(index[cost.argmin()])
         # What lies beside the step belongs to the same ridge: it must not start a line.
-        swallowed = index[(np.abs(forward) < 0.5) & (turn > 0.8) & (owner[index] < 0)]
+        swallowed = index[(np.abs(forward) <= beside) & (turn > 0.8) & (owner[index] < 0)]
         path.append(nearest)
         if owner[nearest] >= 0:
             return path
@@ -157,17 +157,23 @@ def _smooth(line: Array, sigma: float = 2.0) -> Array:
 
 
 def _ends(lines: list[Array]) -> tuple[Array, Array]:
-    """(2n, 2) end points and outward directions over the last four metres of each line."""
+    """(2n, 2) end points and outward directions over the last eight metres of each line.
+
+    From the mean of the outer to the mean of the inner half, so that a wriggle at the very end
+    does not turn it.
+    """
     place, outward = [], []
     for line in lines:
         for points in (line[::-1], line):
             far = np.hypot(*(points - points[-1]).T)
-            inner = points[np.flatnonzero(far > 0.4)] if (far > 0.4).any() else points[:1]
-            back = inner[np.hypot(*(inner - points[-1]).T) <= 4.0]
-            base = back[0] if len(back) else inner[-1]
-            d = points[-1] - base
+            reach = min(8.0, float(far.max()))
+            outer = points[far <= reach / 2].mean(axis=0)
+            inside = (far > reach / 2) & (far <= reach)
+            # Lines of few vertices may have none there: then their far end.
+            inner = points[inside].mean(axis=0) if inside.any() else points[far.argmax()]
+            d = outer - inner
             place.append(points[-1])
-            outward.append(d / max(np.hypot(*d), 1e-9))
+            outward.append(d / max(float(np.hypot(*d)), 1e-9))
     return np.array(place).reshape(-1, 2), np.array(outward).reshape(-1, 2)
 
 

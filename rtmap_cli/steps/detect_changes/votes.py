@@ -19,6 +19,12 @@ Int = NDArray[np.int64]
 
 END_FADE = 3.0
 """Detections are cut short: so near (m) to the end of a line a miss counts less."""
+SEEN_SHARE = 0.3
+"""A drive has seen a place when it found something in this share of the usual rate."""
+NOISE_SCORE = 0.1
+"""A detection of this score or less says nothing …"""
+SURE_NO, SURE_YES = 0.15, 0.85
+"""… nor does an existence up to the first; from the second on the network is sure."""
 FAR_LOSS = 0.5
 """Share of the detection probability that is lost at 36 m."""
 
@@ -39,6 +45,16 @@ class DriveCounts:
 def view_weight(distance: Array) -> Array:
     """Detection probability by distance, relative to a near place: negative evidence weighs so."""
     return 1.0 - FAR_LOSS * np.minimum(distance / 36.0, 1.0) ** 2
+
+
+def detection_value(score: Array) -> Array:
+    """How much of a hit a detection is."""
+    return np.clip((score - NOISE_SCORE) / (1 - NOISE_SCORE), 0.0, 1.0)
+
+
+def answer_value(existence: Array) -> Array:
+    """How much of a hit the network's existence score of a prior element is."""
+    return np.clip((existence - SURE_NO) / (SURE_YES - SURE_NO), 0.0, 1.0)
 
 
 def count(
@@ -88,7 +104,7 @@ def line_counts(
     fade = np.clip(stations.to_end / END_FADE, 0.15, 1.0)
     weight = view_weight(seen.distance) * fade[seen.point]
     keys, values = [], []
-    frame, score = samples.frame[feet.sample], samples.score[feet.sample]
+    frame, value = samples.frame[feet.sample], detection_value(samples.score[feet.sample])
     wide = samples.spacing[feet.sample] > STEP
     for shift in (0, -1, 1):
         place = np.clip(feet.station + shift, 0, n - 1)
@@ -96,7 +112,7 @@ def line_counts(
         # Detections with vertices far apart cover the stations between them, too.
         ok &= wide | (shift == 0) | (np.sign(feet.along) == shift)
         keys.append((frame * n + place)[ok])
-        values.append(score[ok])
+        values.append(value[ok])
     asked_key, asked_value = _asked_stations(stations, ids, traversal)
     keys.append(asked_key)
     values.append(asked_value)
@@ -110,6 +126,7 @@ def _asked_stations(
     n, asked = len(stations), traversal.asked
     row = {name: k for k, name in enumerate(ids)}
     keys, values = [np.zeros(0, np.int64)], [np.zeros(0)]
+    sure = answer_value(asked.existence)
     for q, name in enumerate(asked.element_id):
         k = row.get(name)
         if k is None:
@@ -120,7 +137,7 @@ def _asked_stations(
         # Cheap and sufficient: the stretch asked about is the part of the line in its own box.
         index = index[((xy >= low) & (xy <= high)).all(axis=1)]
         keys.append(asked.frame[q] * n + index)
-        values.append(np.full(len(index), asked.existence[q]))
+        values.append(np.full(len(index), sure[q]))
     return np.concatenate(keys), np.concatenate(values)
 
 
@@ -157,7 +174,7 @@ class Ballot:
             frames_seen=int(self.frames_seen[index].max()),
             frames_in_view=int(self.frames_in_view[index].max()),
             traversals_seen=int(share.sum()),
-            traversals_in_view=int((self.in_view[:, index].mean(axis=1) >= 0.5).sum()),
+            traversals_in_view=int((self.in_view[:, index].mean(axis=1) >= 0.3).sum()),
             first_seen_ns=int(first.min()) if len(first) else None,
             last_seen_ns=int(self.last_ns[index].max()) or None,
             runs=tuple(r for r, s in zip(self.runs, share, strict=True) if s),
@@ -179,8 +196,8 @@ def ballot(
 ) -> Ballot:
     """Put the drives together; the usual hit rate is measured on the places themselves.
 
-    At the first ``old`` places (those of the prior) only ``fresh`` drives vote: what the others
-    said is in the prior already.
+    The first ``old`` places are those of the prior, the others were picked by what was found. At
+    the former only ``fresh`` drives vote: what the others said is in the prior already.
     """
     if fresh is not None and not fresh.all():
         drives = [d if f else _without(d, old) for d, f in zip(drives, fresh, strict=True)]
@@ -189,11 +206,12 @@ def ballot(
     found = usual_rate(hits.sum(axis=0), looked.sum(axis=0), model.found)
     model = model.with_found(found)
     votes = np.zeros((3, hits.shape[1]))
+    picked = np.arange(hits.shape[1]) >= old
     seen = np.zeros(hits.shape, bool)
     for k in range(len(drives)):
-        vote = drive_log_likelihoods(hits[k], looked[k], model)
+        vote = drive_log_likelihoods(hits[k], looked[k], model, picked)
         votes += vote
-        seen[k] = (looked[k] > 0) & (log_odds_of(vote, model) > 0)
+        seen[k] = (looked[k] > 0) & (hits[k] >= SEEN_SHARE * model.found * looked[k])
     first = np.stack([np.where(d.first_ns > 0, d.first_ns, np.iinfo(np.int64).max) for d in drives])
     start = first.min(axis=0)
     return Ballot(
