@@ -17,30 +17,28 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """How errors are composed; metres, radians, shares of the stated variance.
+    """How errors are composed; metres, radians, shares of the stated variance."""
 
-    ``vertex_share``, ``element_share``: see above, the rest is fixed to the place; ``scale``:
-    factor on every stated sigma; ``place_length_m``: correlation length l of the field
-    (exp(-d²/2l²)); ``element_length_m``: travel over which an element's own offset persists;
-    ``map_sigma_m``: per axis, where the map states no covariance; ``map_length_m``: correlation length of the map's
-    error along a line; ``map_persist_m``: travel over which one error of the map stays in range;
-    ``rig_sigma_m``, ``rig_sigma_rad``: constant error of the rig's calibration, which no drive can
-    show; ``outlier_sigma_m``: offset of an element that is not what the map says it is;
-    ``gnss_walk_m``: growth of the GNSS bias (m per √m driven); ``gnss_yaw_length_m``: travel
-    over which a yaw bias persists.
-    """
-
+    # Parts of the stated variance (see above); what they leave is fixed to the place.
     vertex_share: float = 0.2
     element_share: float = 0.3
+    # Factor on every stated sigma.
     scale: float = 1.0
+    # Correlation length l of the field over the map, exp(-d²/2l²).
     place_length_m: float = 20.0
+    # Travel over which an element's own offset persists from frame to frame.
     element_length_m: float = 15.0
+    # The map's own error: per axis where the map states none, its correlation length along a line,
+    # and the travel during which one error of it stays in range.
     map_sigma_m: float = 0.1
     map_length_m: float = 12.0
     map_persist_m: float = 50.0
+    # Constant error of the rig's calibration, which no drive can show.
     rig_sigma_m: float = 0.05
     rig_sigma_rad: float = 0.0005
+    # Offset of an element that is not what the map says it is.
     outlier_sigma_m: float = 2.0
+    # Growth of the GNSS bias (m per √m driven); travel over which a yaw bias persists.
     gnss_walk_m: float = 0.06
     gnss_yaw_length_m: float = 2000.0
 
@@ -57,34 +55,36 @@ class ErrorModel:
 
 @dataclass(frozen=True)
 class Settings:
-    """How the solvers search; metres.
+    """How the solvers search; metres."""
 
-    ``starts_m``: lateral shifts of the start that are tried per frame; ``start_gates_m``: gates of
-    association, widest first, while all of them compete with every second vertex, then while the
-    best ``finalists`` do with all; ``gates_m``: gates of the rounds with the field;
-    ``smooth_gates_m``: the same for the whole log; ``heading_weight_m``: distance that two
-    perpendicular lines are apart in association; ``huber``: vertex residuals beyond this many
-    sigmas count linearly; ``score_logit``: added to the logit of a score: prior log-odds that a
-    detection is on the map; ``min_score``: detections below are left out; ``min_residuals``: fewer
-    vertices than this are no match; ``evidence_share``: what of the difference in evidence between
-    starts is believed (elements are not independent); ``degenerate_m``: a direction (yaw at a lever of
-    10 m) that the map leaves less certain than this is degenerate; ``chunk_m``: travel per block of
-    the solver, longer than the view; ``odometry_share``, ``odometry_rad_per_m``: sigma of odometry
-    that states none.
-    """
-
+    # Lateral shifts of the start that compete in every frame: first all of them with every second
+    # vertex, then the best finalists with all. Per round: the gate of association, and how far the
+    # pose may still be off, which must not make an outlier of a well-measured element.
     starts_m: tuple[float, ...] = (0.0, -0.8, 0.8, -1.6, 1.6, -2.4, 2.4)
     start_gates_m: tuple[tuple[float, ...], tuple[float, ...]] = ((4.0, 3.0), (2.0, 1.5))
+    start_doubts_m: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0, 0.5), (0.25, 0.1))
     finalists: int = 3
+    # The same for the rounds with the field, and for those over the whole log.
     gates_m: tuple[float, ...] = (1.0, 1.0, 1.0)
+    doubts_m: tuple[float, ...] = (0.1, 0.05, 0.0)
     smooth_gates_m: tuple[float, ...] = (3.0, 2.0, 1.5, 1.0, 1.0, 1.0)
+    smooth_doubts_m: tuple[float, ...] = (0.3, 0.2, 0.1, 0.05, 0.0, 0.0)
+    # Distance in association that two perpendicular lines have at the same place.
     heading_weight_m: float = 2.0
+    # Vertex residuals beyond this many sigmas count linearly.
     huber: float = 1.0
+    # Detections with a lower score are left out; the others' prior log-odds to be on the map are
+    # the logit of the score and this.
     min_score: float = 0.05
     score_logit: float = 1.5
+    # What of a difference in evidence between starts is believed: elements are not independent.
     evidence_share: float = 0.5
+    # A direction (yaw at a lever of 10 m) that the map leaves less certain than this is degenerate;
+    # fewer vertices than this are no match.
     degenerate_m: float = 1.0
     min_residuals: int = 5
+    # Travel per block of the whole-log solver: longer than the view.
     chunk_m: float = 100.0
+    # Sigma of odometry that states none: share of a step, radians per metre.
     odometry_share: float = 0.01
     odometry_rad_per_m: float = 0.0009

@@ -43,6 +43,11 @@ class Noise:
     weight: Array
     shared: Array
 
+    def doubted(self, linear: Linear, doubt_m: float) -> Noise:
+        """With ``doubt_m`` more on the common offset: the pose itself is not known better yet."""
+        size = np.hypot(self.shared, linear.normal * doubt_m)
+        return Noise(self.weight, np.copysign(size, linear.normal))
+
 
 def linearize(lines: MapLines, seen: Detections, pose: Array, gate_m: float) -> Linear:
     """Associate every vertex at ``pose`` (T, 3) and differentiate n · (R p + t - q)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,13 +72,13 @@ def _best_start(
     shift = np.repeat(settings.starts_m, t)
     pose[:, 0] -= np.sin(pose[:, 2]) * shift
     pose[:, 1] += np.cos(pose[:, 2]) * shift
-    for gate in settings.start_gates_m[0]:
-        pose, evidence = _start_step(lines, many, pose, gate, model, settings)
+    for rule in _rules(settings, 0):
+        pose, evidence = _start_step(lines, many, pose, rule, model, settings)
     poses = _finalists(pose.reshape(starts, t, 3), evidence.reshape(starts, t), settings)
     count = len(poses)
     many, pose = seen.repeated(count), poses.reshape(-1, 3)
-    for gate in settings.start_gates_m[1]:
-        pose, evidence = _start_step(lines, many, pose, gate, model, settings)
+    for rule in _rules(settings, 1):
+        pose, evidence = _start_step(lines, many, pose, rule, model, settings)
     poses, evidence = pose.reshape(count, t, 3), evidence.reshape(count, t)
     best = poses[evidence.argmax(0), np.arange(t)]
     d = poses - best
@@ -87,6 +88,11 @@ def _best_start(
     votes /= (_distances(poses, poses) < _SAME_M).sum(1)
     votes /= votes.sum(0)
     return best, np.einsum("ht,hti,htj->tij", votes, d, d)
+
+
+def _rules(settings: Settings, stage: int) -> Iterator[tuple[float, float]]:
+    """Gate and doubt (m) of every round of a stage."""
+    yield from zip(settings.start_gates_m[stage], settings.start_doubts_m[stage], strict=True)
 
 
 def _distances(a: Array, b: Array) -> Array:
@@ -118,7 +124,7 @@ def _solve(g: Array, seen: Detections, pose: Array) -> tuple[Array, Array]:
     """The next pose (T, 3) and its covariance (T, 3, 3) from Grams (T, 4, 4) of jacobian and r."""
     information, d = _prior(seen, pose)
     h = g[:, :3, :3] + information[:, :, None] * np.eye(3)
-    covariance = np.linalg.inv(h)
+    covariance: Array = np.linalg.inv(h).astype(np.float64)
     step = -(covariance @ (g[:, :3, 3] + information * d)[..., None])[..., 0]
     return pose + step, covariance
 
@@ -127,19 +133,22 @@ def _start_step(
     lines: MapLines,
     seen: Detections,
     pose: Array,
-    gate: float,
+    rule: tuple[float, float],
     model: ErrorModel,
     settings: Settings,
 ) -> tuple[Array, Array]:
     """One Gauss–Newton step with independent elements; the evidence (T,) is that before it."""
+    gate, doubt = rule
     linear = linearize(lines, seen, pose, gate)
     noise = noise_of(lines, seen, linear, model, model.offset_share)
-    judgement = judge(seen, linear, noise, linear.r, model, settings.huber)
+    doubted = noise.doubted(linear, doubt)
+    judgement = judge(seen, linear, doubted, linear.r, model, settings.huber)
     information, d = _prior(seen, pose)
     evidence: Array = seen.sum_by_frame(judgement.evidence) - 0.5 * (information * d * d).sum(1)
     columns = np.concatenate([linear.jacobian, linear.r[..., None]], axis=-1)
     g = seen.sum_by_frame(gram(columns, judgement.weight(noise), noise.shared))
-    return _solve(g, seen, pose)[0], evidence
+    after, _ = _solve(g, seen, pose)
+    return after, evidence
 
 
 def _refine(
@@ -151,9 +160,9 @@ def _refine(
     settings: Settings,
 ) -> Solution:
     """Gauss–Newton with the field of place errors, which is eliminated class by class."""
-    for gate in settings.gates_m:
+    for gate, doubt in zip(settings.gates_m, settings.doubts_m, strict=True):
         linear = linearize(lines, seen, pose, gate)
-        whole = noise_of(lines, seen, linear, model, model.offset_share)
+        whole = noise_of(lines, seen, linear, model, model.offset_share).doubted(linear, doubt)
         judgement = judge(seen, linear, whole, linear.r, model, settings.huber)
         noise = noise_of(lines, seen, linear, model, model.element_share)
         weight = judgement.weight(noise)

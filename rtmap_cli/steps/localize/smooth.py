@@ -49,10 +49,10 @@ def solve_smooth(
     once = model.element_share + _FIELD_DOUBT * model.place_share
     chunk = chunks(motion.step, settings.chunk_m)
     field: PlaceField | None = None
-    for gate in settings.smooth_gates_m:
+    for gate, doubt in zip(settings.smooth_gates_m, settings.smooth_doubts_m, strict=True):
         linear = linearize(lines, seen, pose, gate)
         field = PlaceField(lines, seen, linear, chunk, model, field)
-        plain = noise_of(lines, seen, linear, model, once)
+        plain = noise_of(lines, seen, linear, model, once).doubted(linear, doubt)
         rest = linear.r + field.predict()
         judgement = judge(seen, linear, plain, rest, model, settings.huber)
         noise = noise_of(lines, seen, linear, model, model.element_share * repeats, map_repeats)
