@@ -59,7 +59,9 @@ def localize(
     start = solve_single(lines, seen, model or ErrorModel(), settings)
     if model is None:
         model = calibrated(lines, seen, start, ErrorModel(), settings)
-        start = solve_single(lines, seen, model, settings)
+        # Other sigmas may choose another start; other shares of them only refine it.
+        found = start if model.scale == ErrorModel().scale else None
+        start = solve_single(lines, seen, model, settings, found)
     name = "matches" if matched else "geometry"
     if smooth:
         motion = motion_of(run.frames, seen.pose, model, settings)
@@ -123,7 +125,8 @@ def _end_to_end(run: Run, origin: Array, smooth: bool, settings: Settings) -> Po
     information = np.where(known[:, None, None], np.linalg.inv(covariance), 0.0)
     pose[:, :2] -= origin
     count = np.where(known, settings.min_residuals, 0)
-    solution = Solution(pose, covariance, information, np.full(len(pose), np.nan), count)
+    chi2, spread = np.full(len(pose), np.nan), np.zeros_like(covariance)
+    solution = Solution(pose, covariance, information, chi2, count, spread)
     # The network states its own covariance: nothing is added to it.
     model = ErrorModel(rig_sigma_m=0.0, rig_sigma_rad=0.0)
     return poses_of(run.frames, solution, origin, "end-to-end", model, settings)

@@ -36,23 +36,35 @@ _SAME_M = 0.3
 class Solution:
     """``pose`` (T, 3) x, y, yaw relative to the lines' origin; ``covariance`` (T, 3, 3) of it;
     ``information`` (T, 3, 3) of the frame's map residuals alone; ``chi2`` (T,); ``residuals`` (T,)
-    vertices that took part."""
+    vertices that took part; ``spread`` (T, 3, 3) what rival starts added to the covariance."""
 
     pose: Array
     covariance: Array
     information: Array
     chi2: Array
     residuals: NDArray[np.int64]
+    spread: Array
 
 
 def solve_single(
-    lines: MapLines, seen: Detections, model: ErrorModel, settings: Settings
+    lines: MapLines,
+    seen: Detections,
+    model: ErrorModel,
+    settings: Settings,
+    before: Solution | None = None,
 ) -> Solution:
-    """Every frame on its own; the GNSS prior is the initial pose with its sigma."""
+    """Every frame on its own; the GNSS prior is the initial pose with its sigma.
+
+    ``before``: answers to refine with another model, instead of searching for a start again.
+    """
     parts = []
     for first in range(0, len(seen), _BATCH):
-        some = seen.between(first, min(first + _BATCH, len(seen)))
-        pose, spread = _best_start(lines, some, model, settings)
+        last = min(first + _BATCH, len(seen))
+        some = seen.between(first, last)
+        if before is None:
+            pose, spread = _best_start(lines, some, model, settings)
+        else:
+            pose, spread = before.pose[first:last], before.spread[first:last]
         parts.append(_refine(lines, some, pose, spread, model, settings))
     names = Solution.__dataclass_fields__
     return Solution(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
@@ -169,8 +181,14 @@ def _refine(
         g = _field_gram(seen, linear, weight, noise.shared, model)
         pose, covariance = _solve(g, seen, pose)
     used = seen.sum_by_frame(((weight > 0) & (judgement.inlier[:, None] > 0.5)).sum(-1))
-    information = g[:, :3, :3]
-    return Solution(pose, covariance + spread, information, g[:, 3, 3], used.astype(np.int64))
+    return Solution(
+        pose,
+        covariance + spread,
+        g[:, :3, :3],
+        g[:, 3, 3],
+        used.astype(np.int64),
+        spread,
+    )
 
 
 def _field_gram(

@@ -68,7 +68,8 @@ def solve_smooth(
         field.update(step)
     used = seen.sum_by_frame(((weight > 0) & (judgement.inlier[:, None] > 0.5)).sum(-1))
     covariance = _pose_blocks(system, chunk, index)
-    return Solution(pose, covariance, information, chi2, used.astype(np.int64))
+    spread = np.zeros_like(covariance)
+    return Solution(pose, covariance, information, chi2, used.astype(np.int64), spread)
 
 
 def chunks(step: Array, length_m: float) -> Index:
