@@ -112,14 +112,16 @@ def test_pose_head_finds_the_correction_despite_outliers(seed: int) -> None:
 
 
 def test_pose_head_says_what_it_cannot_know() -> None:
-    """Two lines along x: forward stays at its prior, sideways is known."""
+    """Two lines along x, places along them unknown to 5 m: sideways is known, forward is not."""
     x = torch.linspace(-30, 30, 20)
     lines = torch.stack([torch.stack([x, torch.full_like(x, y)], -1) for y in (-4.0, 4.0)])[None]
-    estimate = PoseHead()(lines, lines, torch.full_like(lines, 0.1), torch.ones(1, 2))
+    scale = torch.tensor([5.0, 0.1]).expand_as(lines)
+    estimate = PoseHead()(lines, lines, scale, torch.ones(1, 2))
     sigma = estimate.covariance[0].diagonal().sqrt()
-    assert sigma[0] > 2.5 and sigma[1] < 0.1
-    nothing = PoseHead()(lines, lines + 1, torch.full_like(lines, 0.1), torch.zeros(1, 2))
+    assert sigma[0] > 1.0 and sigma[1] < 0.1
+    nothing = PoseHead()(lines, lines + 1, scale, torch.zeros(1, 2))
     assert torch.equal(nothing.delta, torch.zeros(1, 3))
+    assert torch.allclose(nothing.covariance[0].diagonal().sqrt(), PoseHead().prior_sigma)
 
 
 def test_laplace_scale_becomes_a_standard_deviation() -> None:

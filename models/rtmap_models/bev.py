@@ -101,9 +101,7 @@ class BevWarp(nn.Module):
         margin, best = inside.max(dim=1)
         return best, (margin > 0).float()
 
-    def _look_up(
-        self, e: Tensor, best: Tensor, height: int, width: int
-    ) -> tuple[Tensor, Tensor]:
+    def _look_up(self, e: Tensor, best: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
         """(B, points per cell, cells) places in the image of the chosen camera, -1 … 1."""
         x, y = self.ground
         rows = []

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rtmap_cli.steps.simulate.render import render_cameras
 
 from rtmap_cli.geometry.cameras import projection
 from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.logs.log import Rig
 from rtmap_cli.maps.crop import MapIndex
+from rtmap_cli.steps.simulate.render import render_cameras
 from rtmap_cli.steps.simulate.style import make_style
 from rtmap_cli.steps.simulate.town import Town, make_town
 from rtmap_cli.steps.simulate.world import world_from_map

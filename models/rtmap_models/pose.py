@@ -3,8 +3,9 @@
 The prior is cut out with the initial pose, so its vertices p carry the pose error; the refined
 vertices q are where the pictures show them. With ``true map_SE3_ego = initial · SE2(delta)`` both
 are linked by ``p = SE2(delta) q``, linearised ``p - q = t + yaw · J q`` with J = [[0, -1], [1, 0]].
-Only the part along the normal of the line enters (a vertex may slide along its line), weighted by
-existence and the Laplace scale: iteratively reweighted L1, closed form, differentiable.
+A vertex may slide along its line: the part of its error along the normal counts in full, the part
+along the tangent as if its scale were four times larger. Weighted by existence and the Laplace
+scale; iteratively reweighted L1, each step in closed form.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ from rtmap_models.decoder import unit_tangents
 LEVER_M = 10.0
 """Yaw is solved as metres at this distance: all unknowns are then of one size."""
 
-ITERATIONS = 4
+ITERATIONS = 5
+
+ALONG_STRETCH = 4.0
+"""Factor on the scale of residuals along the line."""
 
 
 class PoseEstimate(NamedTuple):
@@ -32,9 +36,9 @@ class PoseEstimate(NamedTuple):
 class PoseHead(nn.Module):
     """Closed form; its only numbers are measured ones, kept with the weights.
 
-    ``inflation`` (3,) multiplies the standard deviations of dx, dy, dyaw: vertices of one element
-    err together, so the plain covariance is too small. ``prior_sigma`` bounds the answer where
-    nothing constrains it: metres, metres, radians.
+    ``inflation`` (3,) multiplies the standard deviations that the vertices give to dx, dy, dyaw:
+    those of one element err together, so the plain covariance is too small. ``prior_sigma`` bounds
+    the answer where nothing constrains it: metres, metres, radians.
     """
 
     inflation: Tensor
@@ -51,31 +55,44 @@ class PoseHead(nn.Module):
         """Prior and refined vertices (B, P, V, 2) m, Laplace scales alike, weights (B, P)."""
         t = unit_tangents(prior)
         normal = torch.stack([-t[..., 1], t[..., 0]], dim=-1)
-        b = (normal * scale).square().sum(-1).sqrt().clamp(min=0.02)
-        residual = (normal * (prior - refined)).sum(-1)
-        turn = (normal[..., 1] * refined[..., 0] - normal[..., 0] * refined[..., 1]) / LEVER_M
-        # Yaw first, forward last: the weakest direction must be the last pivot.
-        rows = torch.stack([turn, normal[..., 1], normal[..., 0]], dim=-1).flatten(1, 2)
-        y = residual.flatten(1)
-        base = (weight[..., None] / b).flatten(1)
-        floor = b.flatten(1) * 0.5
+        parts = [
+            _equations(direction, prior, refined, scale, stretch)
+            for direction, stretch in ((normal, 1.0), (t, ALONG_STRETCH))
+        ]
+        rows, y, b = (torch.cat(values, dim=1) for values in zip(*parts, strict=True))
+        base = weight[..., None].expand(-1, -1, prior.shape[2]).flatten(1).repeat(1, 2) / b
+        floor = b * 0.5
         sigma = torch.stack([self.prior_sigma[2] * LEVER_M, *self.prior_sigma[:2].flip(0)])
         ridge = torch.diag_embed(sigma.square().reciprocal())
         x = torch.zeros_like(rows[:, 0])
         for _ in range(ITERATIONS):
             error = (y - (rows * x[:, None]).sum(-1)).abs()
-            w = base / torch.maximum(error, floor)
-            weighted = rows * w[..., None]
-            normal_matrix = weighted.transpose(1, 2) @ rows + ridge
-            x = solve3(normal_matrix, (weighted * y[..., None]).sum(1))
-        covariance = inverse3(normal_matrix)
-        unit = torch.stack(
-            [torch.ones_like(sigma[0]), torch.ones_like(sigma[0]), sigma[0] * 0 + 1.0 / LEVER_M]
-        )
+            weighted = rows * (base / torch.maximum(error, floor))[..., None]
+            information = weighted.transpose(1, 2) @ rows
+            x = solve3(information + ridge, (weighted * y[..., None]).sum(1))
         order = [2, 1, 0]
-        stretch = unit * self.inflation
-        covariance = covariance[:, order][:, :, order] * stretch[:, None] * stretch
+        shrink = self.inflation.flip(0).reciprocal()
+        covariance = inverse3(information * shrink[:, None] * shrink + ridge)
+        unit = torch.ones_like(sigma)
+        unit[2] = 1.0 / LEVER_M
+        covariance = covariance[:, order][:, :, order] * unit[:, None] * unit
         return PoseEstimate(x[:, order] * unit, covariance)
+
+
+def _equations(
+    direction: Tensor, prior: Tensor, refined: Tensor, scale: Tensor, stretch: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One equation per vertex along unit ``direction`` (B, P, V, 2): rows (B, n, 3) of yaw (times
+    the lever), y, x; residuals (B, n); Laplace scales (B, n) in metres.
+
+    Yaw comes first and forward last: the weakest direction must be the last pivot.
+    """
+    dx, dy = direction.unbind(-1)
+    turn = (dy * refined[..., 0] - dx * refined[..., 1]) / LEVER_M
+    rows = torch.stack([turn, dy, dx], dim=-1).flatten(1, 2)
+    residual = (direction * (prior - refined)).sum(-1).flatten(1)
+    b = (direction * scale).square().sum(-1).sqrt().flatten(1)
+    return rows, residual, b.clamp(min=0.02) * stretch
 
 
 def solve3(matrix: Tensor, right: Tensor) -> Tensor:
