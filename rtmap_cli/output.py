@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -57,7 +58,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
 
 def _number(text: str) -> bool:
     """True for what stands in a column of numbers: figures, shares, a dash for nothing."""
-    return text.strip("+-−– .,%°/") == "" or text.strip("+-−.,%° /")[:1].isdigit()
+    return re.fullmatch(r"[-–—]?|[-+−]?[\d,]*\.?\d+\s?(%|°|m|s)?", text.strip()) is not None
 
 
 def progress(

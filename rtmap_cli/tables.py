@@ -69,6 +69,9 @@ def whole_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     path = Path(path)
     if path.exists() and not overwrite and (not path.is_dir() or any(path.iterdir())):
         raise BadInput(path, "exists already", "choose another output or pass --overwrite")
+    here = Path.cwd().resolve()
+    if path.resolve() in (here, *here.parents, Path.home().resolve()):
+        raise BadInput(path, "is where you are, or above it", "choose another output")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
