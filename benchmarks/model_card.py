@@ -138,11 +138,27 @@ def measure(
         pose.append(np.stack([prior.delta, out["pose_delta"][0] - prior.delta, sigma]))
         spread.append(_errors_of_prior(out, prior))
     result: dict[str, Any] = {"map": scorer.result().as_json()} | _honesty(spread)
+    result["best threshold"] = _best_threshold(scorer)
     if noise is not None:
         result["unchanged prior mAP"] = unchanged.result().mAP
         result["existence AUC"] = _auc(exist)
         result["pose"] = _pose_figures(np.array(pose))
     return result
+
+
+def _best_threshold(scorer: Scorer) -> dict[str, float]:
+    """The score at which F1 is highest (all classes together, 1 m), with precision and recall."""
+    rankings = scorer.rankings.values()
+    scores = np.concatenate([s for r in rankings for s in r.scores])
+    hits = np.concatenate([h[:, 1] for r in rankings for h in r.hits])
+    order = np.argsort(-scores, kind="stable")
+    found = np.cumsum(hits[order])
+    precision = found / np.arange(1, len(found) + 1)
+    recall = found / max(1, sum(r.num_gt for r in rankings))
+    f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-9)
+    k = int(f1.argmax())
+    values = (scores[order][k], f1[k], precision[k], recall[k])
+    return dict(zip(("score", "F1", "precision", "recall"), map(float, values), strict=True))
 
 
 def _detections_of(

@@ -62,7 +62,7 @@ def config_from_dict(values: dict[str, Any], where: str | Path = "configuration"
     if set(values) != known:
         odd = sorted(set(values) ^ known)
         raise BadInput(where, f"missing or unknown keys: {', '.join(odd)}", "see rtmap-tiny.toml")
-    plain = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     config = ModelConfig(**plain)
     x0, y0, x1, y1 = config.range_m
     if x0 != -x1 or y0 != -y1 or x1 <= 0 or y1 <= 0:

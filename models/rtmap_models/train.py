@@ -77,7 +77,7 @@ def train(config: ModelConfig, options: TrainOptions) -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         meet = str(Path(folder) / "meet")
-        mp.start_processes(  # type: ignore[no-untyped-call]
+        mp.start_processes(
             _worker, (config, options, meet), nprocs=options.workers, start_method="spawn"
         )
 
