@@ -87,7 +87,7 @@ class Preset:
 
 PRESETS: dict[str, Preset] = {
     "rtmap-straight": Preset(),
-    "rtmap-turning": Preset(noise=_by_class(3.10, 1.38, 2.00)),
+    "rtmap-turning": Preset(noise=_by_class(3.115, 1.496, 2.005)),
     "mild": Preset(
         noise=_by_class(0.6, 0.5, 0.5),
         false_per_frame=_by_class(0.02, 0.05, 0.05),
