@@ -103,9 +103,11 @@ def prepare(demo: Demo, cycles: int) -> None:
             "-o", f / "logs" / f"drive-{drive}",
         )  # fmt: skip
     specs = [word for change in CHANGES for word in ("--change", change)]
+    # Where every drive passes: a change needs two witnesses.
+    near = [word for log in sorted((f / "logs").iterdir()) for word in ("--near", log)]
     demo.rtmap(
         "simulate", "changes", "--map", f / "town", "--outdate", *specs,
-        "--near", f / "logs" / "drive-1", "--seed", seed, "-o", f / "stale",
+        *near, "--seed", seed, "-o", f / "stale",
         "--truth", f / "changes-truth.json",
     )  # fmt: skip
     demo.rtmap(
@@ -171,7 +173,7 @@ def reported(demo: Demo) -> list[str]:
         drives = f"{p['traversals_seen']} of {p['traversals_in_view']} drives"
         lines.append(
             f"reported: {p['kind']} {p['class']} ({what}), probability {p['probability']:.2f}, "
-            f"seen by {drives}"
+            f"found by {drives} that looked"
         )
     return lines or ["no change was reported"]
 

@@ -17,7 +17,8 @@ from rtmap_cli.output import emit
     "--change", "specs", multiple=True, required=True,
     help="KIND:CLASS or KIND:CLASS*COUNT; delete, insert, move (divider). Repeat it.",
 )  # fmt: skip
-@click.option("--near", help="Only near this drive: av2:LOG_DIR, LOG or town:.")
+@click.option("--near", multiple=True,
+              help="Only near this drive: av2:LOG_DIR, LOG, town:. Repeat: near all.")  # fmt: skip
 @click.option("--drive", type=click.IntRange(0), default=0, show_default=True,
               help="Number of the drive through the town.")  # fmt: skip
 @click.option("--route", type=click.Choice(["straight", "turning"]), default="turning",
@@ -40,7 +41,7 @@ def command(
     map_path: Path,
     map_version: int | None,
     specs: tuple[str, ...],
-    near: str | None,
+    near: tuple[str, ...],
     drive: int,
     route: str,
     length: float,
@@ -66,7 +67,7 @@ def command(
 
     from rtmap_cli.errors import BadInput
     from rtmap_cli.maps.store import read_map, write_new_map
-    from rtmap_cli.steps.simulate.changes import change_world, parse_spec, truth_json
+    from rtmap_cli.steps.simulate.changes import change_world, common_path, parse_spec, truth_json
     from rtmap_cli.steps.simulate.drive_source import Route, find_source, town_info
     from rtmap_cli.steps.simulate.perception import DriveKey
     from rtmap_cli.tables import write_json
@@ -76,10 +77,10 @@ def command(
         raise BadInput(truth, "exists already", "choose another --truth or pass --overwrite")
     old = read_map(map_path, map_version)
     path = None
-    if near is not None:
-        key = DriveKey(world_seed, 0, drive)
-        source = find_source(near, map_path, old, key, Route(route, length, 2.5))
-        path = source.drive.pose[:, :2, 3]
+    if near:
+        key, way = DriveKey(world_seed, 0, drive), Route(route, length, 2.5)
+        sources = [find_source(name, map_path, old, key, way) for name in near]
+        path = common_path([s.drive.pose[:, :2, 3] for s in sources])
     rng = np.random.default_rng([seed, 61])
     made = [s.inverse() for s in wanted] if outdate else wanted
     new, changes = change_world(old, made, rng, path)

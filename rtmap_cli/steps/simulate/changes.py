@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from rtmap_cli.errors import NoAnswer, UsageError
 from rtmap_cli.geometry.polylines import arc_length, is_ring, normals, tangents
@@ -124,6 +125,25 @@ def change_world(
                 where = " near the drive" if near is not None else " in the map"
                 raise NoAnswer(f"no place for {spec.kind}:{spec.class_name}{where}")
     return VectorMap(work.elements.values(), vector_map.crs), work.changes
+
+
+def common_path(paths: Sequence[Array]) -> Array:
+    """The points (n, 2) of the first path that every other one passes within 14 m, not at an end.
+
+    NoAnswer when the paths share nothing.
+    """
+    path = paths[0]
+    if len(paths) == 1:
+        return path
+    shared = np.ones(len(path), bool)
+    for other in paths[1:]:
+        distance, nearest = cKDTree(other).query(path)
+        inside = (nearest > 2) & (nearest < len(other) - 3)
+        shared &= (distance <= SEEN_FROM) & inside
+    shared[:3] = shared[-3:] = False
+    if not shared.any():
+        raise NoAnswer("the drives share no stretch of road")
+    return path[shared]
 
 
 def _shape(spec: ChangeSpec) -> str:

@@ -1,0 +1,34 @@
+"""The scripts of examples/ run as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_the_chain_on_a_real_log(av2_log: Path, tmp_path: Path) -> None:
+    pytest.importorskip("cv2", reason="rendering needs the extra 'simulate'")
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    result = subprocess.run(
+        ["bash", str(ROOT / "examples/av2_chain.sh"), str(av2_log), str(tmp_path), "6"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PATH": path},
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    for name in ("map", "world", "runs/1/poses.parquet", "changes.geojson", "truth.json"):
+        assert (tmp_path / name).exists(), name
+    assert "mAP" in result.stdout and "lateral" in result.stdout
+    versions = subprocess.run(
+        [sys.executable, "-m", "rtmap_cli", "map", "log", str(tmp_path / "map"), "--json"],
+        capture_output=True,
+        text=True,
+    )
+    assert len(json.loads(versions.stdout)["versions"]) == 2
