@@ -52,8 +52,7 @@ class Stretch:
 class Evidence:
     """One element and its stretches; elements found new have ``new`` set and no prior log-odds.
 
-    ``votes`` (3, n) summed log-likelihoods per station (see ``maps.existence``), ``hits`` and
-    ``views`` (n,) summed over the drives, ``drives`` (n,) how many could see the station. Of prior
+    ``hits`` and ``views`` (n,) per station, summed over the drives. Of prior
     lines also ``places``, unit ``normals`` (n, 2) of the stations and the fused ``offset`` of the
     detections to the left of the line with its sigma (m; NaN, inf where unseen).
     """
@@ -63,10 +62,8 @@ class Evidence:
     new: bool
     counts: Counts
     likelihood_ratio: float
-    votes: Array
     hits: Array
     views: Array
-    drives: Array = field(default_factory=lambda: np.zeros(0))
     places: Array = field(default_factory=lambda: np.zeros((0, 2)))
     normals: Array = field(default_factory=lambda: np.zeros((0, 2)))
     offset: Array = field(default_factory=lambda: np.zeros(0))

@@ -130,7 +130,9 @@ def usual_rate(hits: Array, views: Array, default: float, enough: float = 4.0) -
     return float((np.quantile(rate, 0.6) * count + default * 20) / (count + 20))
 
 
-def stretches(evidence: Array, weight: Array, prior: float, switch: float, ring: bool) -> Array:
+def stretches(
+    evidence: Array, weight: Array, prior: float, switch: float, ring: bool
+) -> NDArray[np.bool_]:
     """Which stations of a line exist: the best two-state sequence along it (Viterbi).
 
     ``evidence`` (n,) log-likelihood ratio of each station, ``weight`` (n,) the share of a vote

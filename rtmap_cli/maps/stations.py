@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -284,7 +285,7 @@ def loose_stretches(samples: Samples, taken: NDArray[np.bool_], shortest: float)
     return np.flatnonzero(~taken & (length[run] >= shortest))
 
 
-def smoother(stations: Stations, width: float) -> object:
+def smoother(stations: Stations, width: float) -> Any:
     """Sparse (n, n) Gaussian weights between stations of a chain, ``width`` (m) one sigma.
 
     Stations of one chain are neighbours by distance, whatever line they lie on; opposite

@@ -107,7 +107,8 @@ def _pieces(evidence: Evidence, policy: Policy, charted: _Charted, out: Fusion) 
     if not evidence.in_view:
         out.untouched.append(element.element_id)
         return [_Piece(element, False, False)]
-    kept, gone = [], []
+    kept: list[Stretch] = []
+    gone: list[Stretch] = []
     for stretch in evidence.stretches:
         absent = not stretch.exists and _deletable(element, stretch, policy)
         (gone if absent else kept).append(stretch)
@@ -115,7 +116,6 @@ def _pieces(evidence: Evidence, policy: Policy, charted: _Charted, out: Fusion) 
         out.deleted.append(element.element_id)
     if not kept:
         return []
-    kept = _merged(kept, bool(gone))
     whole = len(kept) == 1 and not gone
     if whole:
         return [_Piece(_updated(element, evidence.likelihood_ratio, evidence.counts), False, True)]
@@ -128,12 +128,6 @@ def _deletable(element: Element, stretch: Stretch, policy: Policy) -> bool:
     looked = element.traversals + stretch.counts.traversals_in_view
     unlikely = float(probability(stretch.log_odds)) < policy.delete_below
     return unlikely and looked >= policy.delete_traversals
-
-
-def _merged(kept: list[Stretch], cut: bool) -> list[Stretch]:
-    """Kept stretches; doubtful ones stay apart so that their doubt is not averaged away."""
-    del cut
-    return sorted(kept, key=lambda s: s.start)
 
 
 def _split(element: Element, kept: list[Stretch]) -> list[_Piece]:

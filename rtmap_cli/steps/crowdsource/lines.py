@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.polylines import is_ring
+from rtmap_cli.geometry.polylines import is_ring, tangents
 from rtmap_cli.logs.traversal import Traversal, pose_variance
 from rtmap_cli.maps.refit import (
     FusionModel,
@@ -117,8 +117,6 @@ def fuse_lines(
 def _known_along(covariance: Array, xy: Array) -> Array:
     """Along a line a vertex may lie anywhere; only the ends are uncertain there, by how
     detections are cut. Interior vertices slide freely and keep what the system gave them."""
-    from rtmap_cli.geometry.polylines import tangents
-
     out = covariance.copy()
     t = tangents(xy)
     for k in (0, -1):
@@ -157,26 +155,30 @@ def snap_ends(points: list[Array], new: Sequence[bool], reach: float, angle: flo
     A stretch that was missing in the prior closes the gap exactly: the new end becomes the old
     vertex. Ends at most ``reach`` m apart whose directions differ by less than ``angle`` (rad).
     """
-    from rtmap_cli.geometry.polylines import tangents
+    from scipy.spatial import cKDTree
 
-    ends: list[tuple[int, int, Array, Array]] = []
+    owner: list[tuple[int, int]] = []
+    place, outward = [], []
     for k, p in enumerate(points):
         if is_ring(p) or len(p) < 2:
             continue
         t = tangents(p)
-        ends += [(k, 0, p[0, :2].copy(), -t[0]), (k, -1, p[-1, :2].copy(), t[-1])]
-    used: set[tuple[int, int]] = set()
+        owner += [(k, 0), (k, -1)]
+        place += [p[0, :2].copy(), p[-1, :2].copy()]
+        outward += [-t[0], t[-1]]
+    if len(owner) < 2:
+        return
     options = []
-    for a in ends:
-        if not new[a[0]]:
+    for i, j in cKDTree(np.array(place)).query_pairs(reach):
+        # An old end keeps its place; of two new ends the first one moves.
+        a, b = (i, j) if new[owner[i][0]] else (j, i)
+        if owner[a][0] == owner[b][0] or not new[owner[a][0]]:
             continue
-        for b in ends:
-            gap = float(np.hypot(*(a[2] - b[2])))
-            if a[0] == b[0] or gap > reach or -(a[3] @ b[3]) < np.cos(angle):
-                continue
-            options.append((gap, a[0], a[1], b[0], b[1]))
-    for _, ka, ea, kb, eb in sorted(options):
-        if (ka, ea) in used or (kb, eb) in used:
+        if -(outward[a] @ outward[b]) >= np.cos(angle):
+            options.append((float(np.hypot(*(place[a] - place[b]))), a, b))
+    used: set[int] = set()
+    for _, a, b in sorted(options):
+        if a in used or b in used:
             continue
-        used |= {(ka, ea), (kb, eb)}
-        points[ka][ea, :2] = points[kb][eb, :2]
+        used |= {a, b}
+        points[owner[a][0]][owner[a][1], :2] = points[owner[b][0]][owner[b][1], :2]

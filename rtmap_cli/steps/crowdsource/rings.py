@@ -72,9 +72,9 @@ def fuse_ring(
         cov = traversal.covariance[index]
         variance = np.maximum((cov[..., 0, 0] + cov[..., 1, 1]).mean(axis=1) / 2, 0.01)
         pose = traversal.pose_covariance[traversal.frame[index]]
-        mean, spread = _drive_mean(rings, variance, traversal.score[index], reference, model)
+        mean, own = _drive_mean(rings, variance, traversal.score[index], reference, model)
         means.append(mean)
-        variances.append(spread + float((pose[:, 0, 0] + pose[:, 1, 1]).mean() / 2))
+        variances.append(own + float((pose[:, 0, 0] + pose[:, 1, 1]).mean() / 2))
     if not means:
         return Fused(points, covariance, False)
     base = None if new else reference

@@ -10,26 +10,25 @@ from numpy.typing import NDArray
 
 from rtmap_cli.formats.changes import ChangeEvent
 from rtmap_cli.geometry.polylines import length
-from rtmap_cli.maps.evidence import Evidence, Policy, Stretch
+from rtmap_cli.maps.evidence import Evidence, Stretch
 from rtmap_cli.maps.existence import logit, probability, runs_of
 
 Array = NDArray[np.float64]
 
 DISPLACED = 0.3
 """A line that lies farther (m) from its place in the map than this is modified …"""
-TOLD = 0.5
-"""… and told of when the displacement of a stretch is at least this (m) on average."""
+TOLD = 0.6
+"""… and told of where it is at least this (m) …"""
+TOLD_LENGTH = 8.0
+"""… over such a length (m): corners and ends alone are no displacement."""
 
 
-def change_events(
-    evidence: Sequence[Evidence], min_probability: float = 0.5, policy: Policy | None = None
-) -> list[ChangeEvent]:
+def change_events(evidence: Sequence[Evidence], min_probability: float = 0.5) -> list[ChangeEvent]:
     """The changes of at least ``min_probability``, most probable first.
 
     A delete is an element or a stretch of it that does not exist, an insert a new element, a
     modify a stretch that exists but elsewhere.
     """
-    policy = policy or Policy()
     out: list[ChangeEvent] = []
     for e in evidence:
         for stretch in e.stretches:
@@ -38,7 +37,7 @@ def change_events(
             elif not stretch.exists:
                 out.append(_event("delete", e, stretch, -stretch.log_odds))
         if not e.new:
-            out += _modified(e, policy)
+            out += _modified(e)
     out = [c for c in out if c.probability >= min_probability]
     return sorted(out, key=lambda c: (-c.probability, c.change_id))
 
@@ -67,7 +66,7 @@ def _change_id(kind: str, element_id: str, geometry: Array) -> str:
     return f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
 
 
-def _modified(evidence: Evidence, policy: Policy) -> list[ChangeEvent]:
+def _modified(evidence: Evidence) -> list[ChangeEvent]:
     """Stretches whose detections agree on another place, across the line.
 
     The probability that the line lies more than ``DISPLACED`` from its place in the map, from the
@@ -83,7 +82,7 @@ def _modified(evidence: Evidence, policy: Policy) -> list[ChangeEvent]:
     out = []
     for run in runs_of(moved):
         points = evidence.places[run] + offset[run, None] * evidence.normals[run]
-        if len(run) < 2 or length(points) < policy.shortest_m:
+        if len(run) < 2 or length(points) < TOLD_LENGTH:
             continue
         if np.ptp(np.sign(offset[run])) > 0:
             continue

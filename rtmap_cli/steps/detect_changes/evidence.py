@@ -19,7 +19,7 @@ from rtmap_cli.maps.existence import (
     runs_of,
     stretches,
 )
-from rtmap_cli.maps.stations import Samples, Stations, stations_of
+from rtmap_cli.maps.stations import GATE, MIN_COS, Samples, Stations, stations_of
 from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, ring_counts
 from rtmap_cli.steps.detect_changes.lines import (
     all_line_counts,
@@ -119,14 +119,33 @@ def _add_offsets(
     """Where the fresh drives put the prior lines, relative to where the map has them."""
     if not prior or not fresh.any():
         return
-    chosen = np.flatnonzero(fresh)
+    chosen = np.flatnonzero(fresh).tolist()
     offset, variance = fused_offsets(
         stations, [traversals[k] for k in chosen], [samples[k] for k in chosen], settings.fusion
     )
+    offset = np.where(_ambiguous(stations), np.nan, offset)
     for k, e in enumerate(prior):
         index = stations.of_line(k)
         e.places, e.normals = stations.xy[index], stations.normal[index]
         e.offset, e.offset_sigma = offset[index], np.sqrt(variance[index])
+
+
+def _ambiguous(stations: Stations) -> NDArray[np.bool_]:
+    """(n,) True where another line, or the far side of an island, runs beside a station.
+
+    A detection between the two may belong to either: it says nothing of a displacement.
+    """
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(stations.xy).query_pairs(2 * GATE, output_type="ndarray")
+    a, b = pairs[:, 0], pairs[:, 1]
+    d = stations.xy[b] - stations.xy[a]
+    apart = np.abs((d * stations.normal[a]).sum(axis=1)) > 0.3
+    parallel = np.abs((stations.tangent[a] * stations.tangent[b]).sum(axis=1)) > MIN_COS
+    beside = apart & parallel
+    out = np.zeros(len(stations), bool)
+    out[a[beside]] = out[b[beside]] = True
+    return out
 
 
 def _supported(
@@ -174,11 +193,11 @@ def _line_evidence(
         # The prior log-odds of an element speak for its length as one vote does.
         weight = stations.spacing[index] / policy.correlation_m
         real = stretches(np.where(looked, evidence, 0.0), weight, before, policy.switch, ring)
+        real = _without_slivers(real, stations.spacing[index], policy.shortest_m, ring)
     parts = []
     for flag in (True, False):
-        for run in runs_of(real == flag, ring and not real.all() and real.any()):
+        for run in runs_of(real == flag, ring and bool(real.any()) and not real.all()):
             parts.append(_stretch(element, stations, votes, index, run, flag, before, policy))
-    parts = _without_slivers(parts, policy)
     mean = _mean_evidence(evidence, stations.spacing[index], looked)
     return Evidence(
         element,
@@ -186,10 +205,8 @@ def _line_evidence(
         new,
         votes.counts(index[looked]),
         mean,
-        votes.votes[:, index],
         votes.hits[index],
         votes.views[index],
-        votes.in_view[:, index].sum(axis=0).astype(np.float64),
     )
 
 
@@ -243,15 +260,15 @@ def _cut_out(points: Array, stations: Stations, places: NDArray[np.int64]) -> Ar
     return np.concatenate([ends[0][None], points[inside], ends[1][None]])
 
 
-def _without_slivers(parts: list[Stretch], policy: Policy) -> list[Stretch]:
-    """Absent stretches too short to be told of join what is beside them (nothing is cut)."""
-    if all(p.exists for p in parts):
-        return parts
-    gone = [p for p in parts if not p.exists and length(p.geometry) >= policy.shortest_m]
-    whole = len(parts) == 1
-    if whole or gone:
-        return [p for p in parts if p.exists or p in gone or whole]
-    return [p for p in parts if p.exists]
+def _without_slivers(
+    real: NDArray[np.bool_], spacing: Array, shortest: float, ring: bool
+) -> NDArray[np.bool_]:
+    """Absent runs too short to be told of count as existing: nothing is cut out there."""
+    out = real.copy()
+    if real.any():
+        for run in runs_of(~real, ring):
+            out[run] = spacing[run].sum() < shortest
+    return out
 
 
 # ---- closed elements
@@ -294,8 +311,6 @@ def _ring_evidence(
         new,
         counts,
         ratio,
-        votes.votes[:, index],
         votes.hits[index],
         votes.views[index],
-        votes.in_view[:, index].sum(axis=0).astype(np.float64),
     )

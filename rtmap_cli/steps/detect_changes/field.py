@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ class Marks:
     sigma: Array
     score: Array
 
-    def select(self, index: NDArray[np.bool_]) -> Marks:
+    def select(self, index: Any) -> Marks:
         """Some of the samples."""
         return Marks(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
@@ -68,7 +69,7 @@ def deposits(marks: Marks, widest: float = 1.2) -> tuple[Int, Array]:
 
 def _coarse_views(coarse: Int, traversal: Traversal) -> Array:
     """(n,) frames of a drive that could see the middles of coarse squares (n, 2)."""
-    middle = (coarse + 0.5) * COARSE * CELL
+    middle: Array = (coarse + 0.5) * COARSE * CELL
     seen = views(middle, traversal.pose, traversal.range_m, traversal.occluders, margin=1.0)
     return np.bincount(seen.point, minlength=len(coarse)).astype(np.float64)
 

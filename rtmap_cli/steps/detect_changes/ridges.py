@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.polylines import length
+from rtmap_cli.geometry.polylines import arc_length, length
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -74,7 +74,7 @@ def ridge_points(
     ok = (curvature < -1e-12) & (np.abs(t * nx) <= 0.6) & (np.abs(t * ny) <= 0.6)
     rows, columns, t, nx, ny = rows[ok], columns[ok], t[ok], nx[ok], ny[ok]
     index = np.stack([columns, rows], axis=-1) + first_cell
-    place = (index + 0.5 + np.stack([t * nx, t * ny], -1)) * cell
+    place: Array = (index + 0.5 + np.stack([t * nx, t * ny], -1)) * cell
     return RidgePoints(
         place,
         np.stack([-ny, nx], axis=-1),
@@ -101,6 +101,7 @@ def trace(points: RidgePoints, high: float, shortest: float) -> list[Array]:
         ahead = _walk(points, where, owner, int(seed), points.direction[seed], len(lines))
         behind = _walk(points, where, owner, int(seed), -points.direction[seed], len(lines))
         line = _smooth(points.xy[[*behind[::-1], int(seed), *ahead]])
+        line = _straight_end(_straight_end(line)[::-1])[::-1]
         lines.append(line)
     return [line for line in lines if len(line) > 1 and length(line) >= shortest]
 
@@ -156,6 +157,24 @@ def _smooth(line: Array, sigma: float = 2.0) -> Array:
     return out
 
 
+def _straight_end(line: Array, reach: float = 2.0, base: float = 5.0) -> Array:
+    """The last ``reach`` metres put on the direction of the ``base`` metres before them.
+
+    Where detections end the field is thin and its ridge wriggles; a line does not.
+    """
+    from_end = arc_length(line[::-1])[::-1]
+    tail = from_end < reach
+    body = (from_end >= reach) & (from_end < reach + base)
+    if body.sum() < 6 or from_end[0] < reach + base:
+        return line
+    first, second = np.array_split(line[body], 2)
+    origin, d = second.mean(axis=0), second.mean(axis=0) - first.mean(axis=0)
+    d = d / max(float(np.hypot(*d)), 1e-9)
+    out = line.copy()
+    out[tail] = origin + ((line[tail] - origin) @ d)[:, None] * d
+    return out
+
+
 def _ends(lines: list[Array]) -> tuple[Array, Array]:
     """(2n, 2) end points and outward directions over the last eight metres of each line.
 
@@ -185,28 +204,42 @@ def join_collinear(
     With ``corner`` > 0 (m) ends that meet at a corner are extended to where their tangents
     cross, if that is at most so far from both (boundaries turn sharply at junctions).
     """
-    from scipy.spatial import cKDTree
-
     lines = list(lines)
     while len(lines) > 1:
-        place, outward = _ends(lines)
-        pairs = cKDTree(place).query_pairs(max(gap, 1.5 * corner), output_type="ndarray")
-        best: tuple[float, int, int, Array | None] | None = None
-        for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))] if len(pairs) else []:
-            if a // 2 == b // 2:
-                continue
-            found = _join_cost(place[a], outward[a], place[b], outward[b], gap, angle, corner)
-            if found is not None and (best is None or found[0] < best[0]):
-                best = (found[0], int(a), int(b), found[1])
-        if best is None:
+        pairs = _joins(lines, gap, angle, corner)
+        if not pairs:
             break
-        _, a, b, middle = best
-        first = lines[a // 2] if a % 2 else lines[a // 2][::-1]
-        second = lines[b // 2][::-1] if b % 2 else lines[b // 2]
-        parts = [first, second] if middle is None else [first, middle[None], second]
-        merged = np.concatenate(parts)
-        lines = [x for k, x in enumerate(lines) if k not in (a // 2, b // 2)] + [merged]
+        used: set[int] = set()
+        merged: list[Array] = []
+        for _, a, b, middle in pairs:
+            # One join per line and round: its new ends are looked at in the next one.
+            if a // 2 in used or b // 2 in used:
+                continue
+            used |= {a // 2, b // 2}
+            first = lines[a // 2] if a % 2 else lines[a // 2][::-1]
+            second = lines[b // 2][::-1] if b % 2 else lines[b // 2]
+            between = [] if middle is None else [middle[None]]
+            merged.append(np.concatenate([first, *between, second]))
+        lines = [x for k, x in enumerate(lines) if k not in used] + merged
     return lines
+
+
+def _joins(
+    lines: list[Array], gap: float, angle: float, corner: float
+) -> list[tuple[float, int, int, Array | None]]:
+    """Possible joins, cheapest first: cost, the two ends (2 · line, + 1 for its last point), and
+    the corner between them or None."""
+    from scipy.spatial import cKDTree
+
+    place, outward = _ends(lines)
+    found = []
+    for a, b in cKDTree(place).query_pairs(max(gap, 1.5 * corner), output_type="ndarray").tolist():
+        if a // 2 == b // 2:
+            continue
+        cost = _join_cost(place[a], outward[a], place[b], outward[b], gap, angle, corner)
+        if cost is not None:
+            found.append((cost[0], a, b, cost[1]))
+    return sorted(found, key=lambda j: j[:3])
 
 
 def _join_cost(

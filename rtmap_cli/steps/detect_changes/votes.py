@@ -81,8 +81,8 @@ def count(
     np.minimum.at(start, place, time)
     np.maximum.at(last, place, time)
     return DriveCounts(
-        np.bincount(place, value * weight[at], n),
-        np.bincount(seen.point, weight, n),
+        np.bincount(place, value * weight[at], n).astype(np.float64),
+        np.bincount(seen.point, weight, n).astype(np.float64),
         np.bincount(place, minlength=n),
         np.bincount(seen.point, minlength=n),
         np.where(last > 0, start, 0),
