@@ -217,6 +217,9 @@ def chain_of(place: Place, kind: str, work: Path, options: argparse.Namespace) -
         command("crowdsource", run, "--map", work / "map")
         score = compare(read_map(work / "map"), place.world, judged_at, Settings())
         scores[f"cycle_{cycle}"] = percent(score)
+    command("crowdsource", work / "runs", "--map", work / "batch")
+    score = compare(read_map(work / "batch"), place.world, judged_at, Settings())
+    scores["all_at_once"] = percent(score)
     share = float(np.mean(np.concatenate(shared)))
     seconds = time.perf_counter() - started
     return {"poses": poses, "ap": scores, "shared_frames": share, "seconds": round(seconds)}
