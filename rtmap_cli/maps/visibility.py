@@ -56,8 +56,7 @@ def hidden(points: Array, boxes: Array) -> NDArray[np.bool_]:
         enter = np.maximum(enter, np.minimum(a, b))
         leave = np.minimum(leave, np.maximum(a, b))
     around = (np.abs(ox) <= half[:, 0]) & (np.abs(oy) <= half[:, 1])
-    behind: NDArray[np.bool_] = ((enter <= leave) & ~around[:, None]).any(axis=0)
-    return behind
+    return np.asarray(((enter <= leave) & ~around[:, None]).any(axis=0), np.bool_)
 
 
 def in_sectors(points: Array, sectors: Sectors) -> NDArray[np.bool_]:

@@ -69,7 +69,7 @@ def deposits(marks: Marks, widest: float = 1.2) -> tuple[Int, Array]:
 
 def _coarse_views(coarse: Int, traversal: Traversal) -> Array:
     """(n,) frames of a drive that could see the middles of coarse squares (n, 2)."""
-    middle: Array = (coarse + 0.5) * COARSE * CELL
+    middle = np.asarray((coarse + 0.5) * COARSE * CELL, np.float64)
     seen = views(middle, traversal.pose, traversal.range_m, traversal.occluders, margin=1.0)
     return np.bincount(seen.point, minlength=len(coarse)).astype(np.float64)
 

@@ -74,7 +74,7 @@ def ridge_points(
     ok = (curvature < -1e-12) & (np.abs(t * nx) <= 0.6) & (np.abs(t * ny) <= 0.6)
     rows, columns, t, nx, ny = rows[ok], columns[ok], t[ok], nx[ok], ny[ok]
     index = np.stack([columns, rows], axis=-1) + first_cell
-    place: Array = (index + 0.5 + np.stack([t * nx, t * ny], -1)) * cell
+    place = np.asarray((index + 0.5 + np.stack([t * nx, t * ny], -1)) * cell, np.float64)
     return RidgePoints(
         place,
         np.stack([-ny, nx], axis=-1),
