@@ -86,11 +86,11 @@ def town_drive(
 
 
 def lane_traffic(
-    drive: Drive, lanes: Sequence[Lane], surface: Any, key: DriveKey, mean: float = 14.0
+    drive: Drive, lanes: Sequence[Lane], surface: Any, key: DriveKey, mean: float = 9.0
 ) -> Drive:
     """The drive with vehicles that follow lanes near it or are parked at their side.
 
-    About ``mean`` vehicles come near the whole drive; none overlaps the ego vehicle.
+    ``mean`` vehicles are drawn (Poisson); those that would run into the ego vehicle are left out.
     """
     rng = generator(*key.drive, "lane traffic")
     seconds = (drive.timestamp_ns - drive.timestamp_ns[0]) / 1e9
@@ -107,7 +107,8 @@ def lane_traffic(
             speed = TOWN_SPEED * rng.uniform(0.4, 1.3)
             track = _moving(path, seconds, speed, rng.uniform(-0.5, 1.0) * seconds[-1])
         vehicle = random_vehicle(rng, 0.0, 0.0, 0.0)
-        for k in _clear_frames(ego, track, vehicle):
+        frames = _seen_frames(ego, track, vehicle)
+        for k in () if frames is None else frames:
             boxes[k].append(_in_ego(ego[k], track[k], vehicle))
     return replace(drive, occluders=[tuple(b) for b in boxes])
 
@@ -148,16 +149,15 @@ def _parked(rng: np.random.Generator, path: Array, surface: Any, frames: int) ->
     return np.tile([*(path[k] + offset * right), yaw], (frames, 1))
 
 
-def _clear_frames(ego: Array, track: Array, vehicle: Occluder) -> NDArray[np.int64]:
-    """Frames in which the vehicle is near and does not overlap the ego vehicle."""
+def _seen_frames(ego: Array, track: Array, vehicle: Occluder) -> NDArray[np.int64] | None:
+    """Frames in which the vehicle is near; None when it would run into the ego vehicle."""
     gap = track[:, :2] - ego[:, :2]
     along = gap[:, 0] * np.cos(ego[:, 2]) + gap[:, 1] * np.sin(ego[:, 2])
     across = gap[:, 1] * np.cos(ego[:, 2]) - gap[:, 0] * np.sin(ego[:, 2])
     # The ego origin lies over its rear axle: 4 m of vehicle in front, 1 m behind.
     half = vehicle.length / 2
     beside = (np.abs(across) < 1.6 + vehicle.width / 2) & (along > -2 - half) & (along < 5 + half)
-    near = np.hypot(along, across) < REACH
-    return np.flatnonzero(near & ~beside)
+    return None if beside.any() else np.flatnonzero(np.hypot(along, across) < REACH)
 
 
 def _in_ego(ego: Array, place: Array, vehicle: Occluder) -> Occluder:

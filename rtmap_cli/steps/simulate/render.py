@@ -256,7 +256,7 @@ def _finish(
     if style.blur:
         image = cv2.GaussianBlur(image, (0, 0), max(0.3, style.blur * camera.width / 224))
     if style.noise:
-        field = noise_fields()[0]
+        field = noise_fields()[..., 0]
         h, w = min(camera.height, 1024), min(camera.width, 1024)
         i, j = rng.integers(0, 1025 - h), rng.integers(0, 1025 - w)
         grain = field[i : i + h, j : j + w] * np.float32(style.noise)

@@ -64,7 +64,7 @@ def world_from_map(
     if surface_map is not None:
         old_rings, old_curbs, _ = _rings(surface_map)
         surface = _even_odd(old_rings)
-        gaps = gaps + _missing(old_curbs, curbs)
+        gaps = _missing(old_curbs, curbs)
     shapely.prepare(surface)
     paint = [p for e in vector_map.of_class("divider") for p in _line_paint(e, rng_for(e, seed))]
     width = float(rng.uniform(0.3, 0.55))
@@ -133,7 +133,7 @@ def _line_paint(element: Element, rng: np.random.Generator) -> list[Paint]:
     if mark in ("NONE", "UNKNOWN"):
         return []
     colour = "yellow" if "YELLOW" in mark else "white"
-    width = rng.uniform(0.11, 0.17)
+    width = rng.uniform(0.14, 0.21)
     dash, gap = rng.uniform(2.5, 3.5), rng.uniform(4.0, 8.5)
     line = resample_step(element.xy, 2.0)
     first, second = "DASHED" in mark, "DASHED" in mark

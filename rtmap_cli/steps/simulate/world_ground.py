@@ -25,6 +25,8 @@ TILE = 256
 MAX_TILES = 800
 """Tiles kept per world (0.5 MB each); the oldest are dropped."""
 NOISE_SIZE = 1024
+NOISE_STEP = 0.11
+"""Metres per pixel of the noise; it repeats after 113 m."""
 SUBPIXEL = 4
 """Fractional bits of the drawing coordinates."""
 
@@ -45,24 +47,43 @@ def opencv() -> Any:
 
 @cache
 def noise_fields() -> NDArray[np.float32]:
-    """(4, 1024, 1024) periodic unit-variance noise of correlation 1, 5, 24 and 80 pixels."""
+    """(1024, 1024, 4) periodic unit-variance noise of correlation 1, 5, 24 and 80 pixels."""
     rng = np.random.default_rng(7)
-    out = np.empty((4, NOISE_SIZE, NOISE_SIZE), np.float32)
+    out = np.empty((NOISE_SIZE, NOISE_SIZE, 4), np.float32)
     f = np.fft.fftfreq(NOISE_SIZE)
     square = f[:, None] ** 2 + f[None, : NOISE_SIZE // 2 + 1] ** 2
     for k, sigma in enumerate((0.7, 3.5, 16.0, 55.0)):
         white = np.fft.rfft2(rng.standard_normal((NOISE_SIZE, NOISE_SIZE)))
         smooth = np.fft.irfft2(white * np.exp(-2 * (np.pi * sigma) ** 2 * square))
-        out[k] = smooth / smooth.std()
+        out[..., k] = smooth / smooth.std()
     return out
 
 
-def _noise(field: int, x0: float, y0: float, step: float, unit: float) -> NDArray[np.float32]:
-    """A tile of noise whose pixels are ``unit`` metres, sampled every ``step`` metres."""
-    k = np.arange(TILE)
-    cols = np.floor((x0 + k * step) / unit).astype(np.int64) % NOISE_SIZE
-    rows = np.floor((y0 + k * step) / unit).astype(np.int64) % NOISE_SIZE
-    return noise_fields()[field][rows][:, cols]
+@cache
+def _ground_noise() -> NDArray[np.float32]:
+    """(1024, 1024, 5): what the ground takes of the noise, one pixel per NOISE_STEP metres.
+
+    Texture of asphalt and verge (mean one half), blotches of old asphalt, fine and broad wear.
+    """
+    fine, middle, coarse, broad = np.moveaxis(noise_fields(), -1, 0)
+    return np.stack(
+        [
+            np.clip(0.5 + 0.09 * fine + 0.05 * middle + 0.07 * coarse + 0.05 * broad, 0, 1),
+            np.clip(0.5 + 0.06 * fine + 0.09 * middle + 0.12 * coarse, 0, 1),
+            broad * 0.6 + coarse * 0.8 - 1.6,
+            1.05 - 0.1 * np.abs(middle) - 0.08 * fine,
+            0.6 + 0.5 * broad,
+        ],
+        axis=-1,
+    )
+
+
+def _noise(x0: float, y0: float, step: float) -> NDArray[np.float32]:
+    """(256, 256, 5) noise of a tile with this lower left corner."""
+    k = (np.arange(TILE) + 0.5) * step
+    cols = np.floor((x0 + k) / NOISE_STEP).astype(np.int64) % NOISE_SIZE
+    rows = np.floor((y0 + k) / NOISE_STEP).astype(np.int64) % NOISE_SIZE
+    return _ground_noise().reshape(-1, 5)[rows[:, None] * NOISE_SIZE + cols]
 
 
 def _layout(world: World) -> dict[str, Any]:
@@ -124,22 +145,24 @@ def draw_tile(world: World, x0: float, y0: float, step: float, level: int) -> Im
     """One tile (2, 256, 256, 4) with its lower left corner at (x0, y0) in the map frame."""
     cv2 = opencv()
     layout = _layout(world)
-    fine = 1 if level == 0 else 2
-    size, scale = TILE * fine, fine / step
+    # Coverage comes from finer pixels (OpenCV's own anti-aliasing widens every polygon), one row
+    # and column of them more on each side, because filling is inexact along the border.
+    fine = 4 if level < 2 else 8
+    size, scale = (TILE + 2) * fine, fine / step
     side = TILE * step
     margin = 4.0
 
     def pixels(points: Array) -> NDArray[np.int32]:
-        p = ((points - (x0, y0)) * scale - 0.5) * (1 << SUBPIXEL)
+        p = ((points - (x0 - step, y0 - step)) * scale - 0.5) * (1 << SUBPIXEL)
         return np.round(p).astype(np.int32)
 
     def fill(polygons: list[NDArray[np.int32]], even_odd: bool) -> Image:
         mask = np.zeros((size, size), np.uint8)
         if even_odd and polygons:
-            cv2.fillPoly(mask, polygons, 255, cv2.LINE_AA, SUBPIXEL)
+            cv2.fillPoly(mask, polygons, 255, cv2.LINE_8, SUBPIXEL)
         else:
             for polygon in polygons:
-                cv2.fillPoly(mask, [polygon], 255, cv2.LINE_AA, SUBPIXEL)
+                cv2.fillPoly(mask, [polygon], 255, cv2.LINE_8, SUBPIXEL)
         return mask
 
     window = shapely.box(x0 - margin, y0 - margin, x0 + side + margin, y0 + side + margin)
@@ -152,12 +175,18 @@ def draw_tile(world: World, x0: float, y0: float, step: float, level: int) -> Im
     curb = _draw_curbs(cv2, world, layout, (x0, y0, side), pixels, size, scale)
     white, yellow = _draw_paint(cv2, world, layout, (x0, y0, side), pixels, size)
     soft = _touching(layout["soft"], x0 - 12, y0 - 12, x0 + side + 12, y0 + side + 12)
-    if len(soft):
-        asphalt, outer = _soften(cv2, world, soft, asphalt, outer, pixels, scale)
     layers = [asphalt, outer, curb, white, yellow]
-    if fine > 1:
-        layers = [cv2.resize(m, (TILE, TILE), interpolation=cv2.INTER_AREA) for m in layers]
-    shares = [m.astype(np.float32) / np.float32(255) for m in layers]
+    inner = slice(fine, -fine)
+    shares = []
+    for mask in layers:
+        share = np.zeros((TILE, TILE), np.float32)
+        if mask.any():
+            small = cv2.resize(mask[inner, inner], (TILE, TILE), interpolation=cv2.INTER_AREA)
+            np.multiply(small, np.float32(1 / 255), out=share)
+        shares.append(share)
+    if len(soft):
+        paved = _soften(cv2, world, soft, (x0, y0, side))
+        shares[:2] = [np.maximum(shares[0], paved), np.maximum(shares[1], paved)]
     return _mix(layout, x0, y0, step, shares)
 
 
@@ -186,7 +215,7 @@ def _draw_curbs(
         strip = shapely.buffer(line, width / 2, cap_style="flat", join_style="mitre")
         rings = [pixels(r) for r in _rings_of(strip)]
         if rings:
-            cv2.fillPoly(mask, rings, 255, cv2.LINE_AA, SUBPIXEL)
+            cv2.fillPoly(mask, rings, 255, cv2.LINE_8, SUBPIXEL)
     return mask
 
 
@@ -198,22 +227,27 @@ def _draw_paint(
     masks = {"white": np.zeros((size, size), np.uint8), "yellow": np.zeros((size, size), np.uint8)}
     for k in _touching(layout["paint"], x0, y0, x0 + side, y0 + side):
         paint = world.paint[k]
-        cv2.fillPoly(masks[paint.colour], [pixels(paint.polygon)], 255, cv2.LINE_AA, SUBPIXEL)
+        cv2.fillPoly(masks[paint.colour], [pixels(paint.polygon)], 255, cv2.LINE_8, SUBPIXEL)
     return masks["white"], masks["yellow"]
 
 
 def _soften(
-    cv2: Any, world: World, soft: NDArray[np.int64], asphalt: Image, outer: Image,
-    pixels: Any, scale: float,
-) -> tuple[Image, Image]:  # fmt: skip
-    """Where a curb is gone the ground beside it is paved: asphalt fades out over 6 to 12 m."""
-    near = np.zeros_like(asphalt)
-    thick = max(1, round(9.0 * 2 * scale))
+    cv2: Any, world: World, soft: NDArray[np.int64], box: tuple[float, float, float]
+) -> NDArray[np.float32]:
+    """(256, 256) share of paving beside edges without a curb: full at the edge, 0 from 14 m on."""
+    x0, y0, side = box
+    margin, scale = 20.0, 2.0
+    size = int(np.ceil((side + 2 * margin) * scale))
+    near = np.zeros((size, size), np.uint8)
     for k in soft:
-        cv2.polylines(near, [pixels(world.soft[k])], False, 255, thick, cv2.LINE_8, SUBPIXEL)
-    sigma = max(0.6, 2.5 * scale)
-    near = cv2.GaussianBlur(near, (0, 0), sigma)
-    return np.maximum(asphalt, near), np.maximum(outer, near)
+        points = ((world.soft[k] - (x0 - margin, y0 - margin)) * scale - 0.5) * (1 << SUBPIXEL)
+        line = np.round(points).astype(np.int32)
+        cv2.polylines(near, [line], False, 255, round(18 * scale), cv2.LINE_8, SUBPIXEL)
+    near = cv2.GaussianBlur(near, (0, 0), 2.5 * scale)
+    at = ((np.arange(TILE, dtype=np.float32) + 0.5) * side / TILE + margin) * scale - 0.5
+    u, v = np.meshgrid(at.astype(np.float32), at.astype(np.float32))
+    share: NDArray[np.float32] = cv2.remap(near, u, v, cv2.INTER_LINEAR).astype(np.float32)
+    return share / np.float32(255)
 
 
 def _mix(
@@ -229,18 +263,9 @@ def _mix(
     """
     asphalt, outer, curb, white, yellow = drawn
     ox, oy = layout["offset"]
-
-    def noise(field: int, unit: float) -> NDArray[np.float32]:
-        return _noise(field, x0 + ox * 10, y0 + oy * 10, step, unit)
-
-    fine, middle, coarse, broad = (
-        noise(0, 0.07),
-        noise(1, 0.125),
-        noise(2, 0.125),
-        noise(3, 0.25),
-    )
-    wear = 1.05 - layout["wear"] * (0.6 + 0.5 * broad) - 0.1 * np.abs(middle) - 0.08 * fine
-    wear = np.clip(wear, 0.12, 1.0)
+    noise = _noise(x0 + ox * 10, y0 + oy * 10, step)
+    texture, verge, blotches, fine_wear, broad_wear = np.moveaxis(noise, -1, 0)
+    wear = np.clip(fine_wear - np.float32(layout["wear"]) * broad_wear, 0.12, 1.0)
     white, yellow = white * wear, yellow * wear
     white = np.minimum(white, 1 - yellow)
     left = 1 - white - yellow
@@ -248,9 +273,7 @@ def _mix(
     left -= curb
     road = asphalt * left
     side = np.clip(outer - asphalt, 0, 1) * left
-    texture = np.clip(0.5 + 0.09 * fine + 0.05 * middle + 0.07 * coarse + 0.05 * broad, 0, 1)
-    patch = np.clip((broad * 0.6 + coarse * 0.8 - 1.6 + layout["patches"]) * 4, 0, 1)
-    verge = np.clip(0.5 + 0.06 * fine + 0.09 * middle + 0.12 * coarse, 0, 1)
+    patch = np.clip((blotches + np.float32(layout["patches"])) * 4, 0, 1)
     out = np.empty((2, TILE, TILE, 4), np.float32)
     for k, layer in enumerate((side, curb, road, white)):
         out[0, ..., k] = layer
