@@ -106,7 +106,7 @@ def test_a_displaced_line_is_a_modify_and_not_a_delete(rtmap: Call, tmp_path: Pa
     prior = street(line("off", "divider", 0.9), without=["middle", "lane"])
     world = street(without=["lane"])
     runs = [drive(world, f"d{k}", seed=k) for k in range(3)]
-    found = _detect(rtmap, tmp_path, prior, runs)
+    found = _detect(rtmap, tmp_path, prior, runs, "--displaced")
     assert {f["properties"]["kind"] for f in found} == {"modify"}
     assert np.abs(_local(found[0])[:, 1]).max() < 0.3
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Leave out less probable changes.",
 )
+@click.option("--displaced", is_flag=True, help="Also tell of lines that lie elsewhere (modify).")
 @click.option("--fail-on-change", is_flag=True, help="Exit 1 when a change is found.")
 @click.option(
     "--write-runs", is_flag=True, help="Also write RUN/changes.parquet: what each run says alone."
@@ -37,12 +38,13 @@ def command(
     map_version: int | None,
     output: Path,
     min_probability: float,
+    displaced: bool,
     fail_on_change: bool,
     write_runs: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Tell which elements of the map are gone, displaced, or missing, from one or more RUNs.
+    """Tell which elements of the map are gone or missing (with --displaced: elsewhere), from one or more RUNs.
 
     Evidence is gathered per frame, put together per run (one vote), then over the runs: an element
     that was in view and not hidden but not found speaks for a delete, detections that match
@@ -73,7 +75,7 @@ def command(
     evidence = gather_evidence(traversals, prior, classes)
     if len(prior) and not any(e.in_view for e in evidence if not e.new):
         raise NoAnswer(f"{map_path}: none of its elements is in view of any frame of these runs")
-    found = change_events(evidence, min_probability)
+    found = change_events(evidence, min_probability, displaced)
     info = {
         "map": str(map_path),
         "map_version": prior.version,
@@ -84,7 +86,8 @@ def command(
     write_changes(found, prior.crs, output, info)
     if write_runs:
         for path, traversal in zip(runs, traversals, strict=True):
-            alone = change_events(gather_evidence([traversal], prior, classes), min_probability)
+            own = gather_evidence([traversal], prior, classes)
+            alone = change_events(own, min_probability, displaced)
             write_change_table(alone, path / "changes.parquet", prior.crs)
     kilometres = sum(t.kilometres for t in traversals)
     counts = {k: sum(c.kind == k for c in found) for k in ("delete", "insert", "modify")}

@@ -23,11 +23,13 @@ TOLD_LENGTH = 8.0
 """… over such a length (m): corners and ends alone are no displacement."""
 
 
-def change_events(evidence: Sequence[Evidence], min_probability: float = 0.5) -> list[ChangeEvent]:
+def change_events(
+    evidence: Sequence[Evidence], min_probability: float = 0.5, displaced: bool = False
+) -> list[ChangeEvent]:
     """The changes of at least ``min_probability``, most probable first.
 
     A delete is an element or a stretch of it that does not exist, an insert a new element, a
-    modify a stretch that exists but elsewhere.
+    modify (only with ``displaced``) a stretch that exists but elsewhere.
     """
     out: list[ChangeEvent] = []
     for e in evidence:
@@ -36,7 +38,7 @@ def change_events(evidence: Sequence[Evidence], min_probability: float = 0.5) ->
                 out.append(_event("insert", e, stretch, stretch.log_odds))
             elif not stretch.exists:
                 out.append(_event("delete", e, stretch, -stretch.log_odds))
-        if not e.new:
+        if displaced and not e.new:
             out += _modified(e)
     out = [c for c in out if c.probability >= min_probability]
     return sorted(out, key=lambda c: (-c.probability, c.change_id))
