@@ -44,7 +44,7 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Tell which elements of the map are gone or missing (with --displaced: elsewhere), from one or more RUNs.
+    """Tell which elements of the map are gone and which it lacks, from one or more RUNs.
 
     Evidence is gathered per frame, put together per run (one vote), then over the runs: an element
     that was in view and not hidden but not found speaks for a delete, detections that match
