@@ -40,10 +40,12 @@ class RTMapNet(nn.Module):
     """Images and prior in, elements, existence and pose out.
 
     ``sigma_factor`` (C, 2) is measured after training: what the Laplace scale of each class (new,
-    prior) must be multiplied with to be honest.
+    prior) must be multiplied with to be honest. So is ``score_line`` (2, C, 2): per mode (without,
+    with a prior) and class the slope and offset that make the logits of new queries probabilities.
     """
 
     sigma_factor: Tensor
+    score_line: Tensor
 
     def __init__(self, config: ModelConfig):
         super().__init__()
@@ -57,6 +59,9 @@ class RTMapNet(nn.Module):
         self.decoder = Decoder(config)
         self.pose = PoseHead()
         self.register_buffer("sigma_factor", torch.ones(len(config.classes), 2))
+        line = torch.tensor([1.0, 0.0]).repeat(2, len(config.classes), 1)
+        # Not kept with the weights: measured anew for every export.
+        self.register_buffer("score_line", line, persistent=False)
 
     def predict(
         self,
@@ -90,7 +95,9 @@ class RTMapNet(nn.Module):
         used = prior_mask.float()
         one_hot = F.one_hot(prior_class.clamp(0, classes - 1), classes).float()
         exists = last.logits[:, n:, classes].sigmoid() * used
-        new_scores = last.logits[:, :n, :classes].sigmoid()
+        aided = (used.sum(dim=1) > 0).long()
+        line = self.score_line[aided][:, None]  # (B, 1, C, 2)
+        new_scores = (last.logits[:, :n, :classes] * line[..., 0] + line[..., 1]).sigmoid()
         scores = torch.cat([new_scores, one_hot * exists[..., None]], dim=1)
         best = torch.cat([new_scores.argmax(-1), prior_class.clamp(0, classes - 1)], dim=1)
         points = self._close(last.points, best)

@@ -69,12 +69,14 @@ def command(
     }
     if name:
         metadata["model_name"] = name
-    factors: dict[str, float] = {}
+    factors: dict[str, Any] = {}
     if calibrate is not None:
         from rtmap_models.calibrate import calibrate as scale
         from rtmap_models.dataset import Frames
+        from rtmap_models.scores import calibrate_scores
 
-        factors = scale(network, Frames(calibrate, network.config))
+        held_out = Frames(calibrate, network.config)
+        factors = {**scale(network, held_out), **calibrate_scores(network, held_out)}
         metadata["calibration"] = factors
     differences = export_onnx(network, output, metadata)
     megabytes = output.stat().st_size / 1e6

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,3 +60,29 @@ def prior_slots(
         element_ids=[e.source.element_id for e in chosen],
         dropped=len(known) - len(chosen),
     )
+
+
+DUPLICATE_M = 1.0
+"""A detection so near (m, on average) to an answered prior slot of its class is that element."""
+
+
+def on_prior(
+    points: NDArray[Any],
+    class_id: NDArray[Any],
+    slots: NDArray[Any],
+    slot_class: NDArray[Any],
+    near: float = DUPLICATE_M,
+) -> NDArray[np.bool_]:
+    """Which detections (n, V, 2) lie on an answered prior slot (m, V, 2) of their class (ego, m).
+
+    The mean distance of the detection's vertices to the slot counts: a piece of a line lies on it.
+    """
+    out = np.zeros(len(points), bool)
+    for line, name in zip(slots, slot_class, strict=True):
+        rows = np.flatnonzero((class_id == name) & ~out)
+        if not len(rows):
+            continue
+        dense = resample(np.asarray(line, np.float64), 4 * len(line))
+        gap = np.hypot(*np.moveaxis(points[rows][:, :, None] - dense, -1, 0)).min(axis=2)
+        out[rows] = gap.mean(axis=1) < near
+    return out

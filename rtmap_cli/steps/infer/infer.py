@@ -26,7 +26,7 @@ from rtmap_cli.logs.run import (
 )
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import VectorMap
-from rtmap_cli.maps.prior import PriorSlots, prior_slots
+from rtmap_cli.maps.prior import PriorSlots, on_prior, prior_slots
 from rtmap_cli.steps.infer.images import FittedCamera
 from rtmap_cli.steps.infer.model import MapModel
 
@@ -220,18 +220,26 @@ def _observations(
     slots: PriorSlots,
     options: InferOptions,
 ) -> Observations:
-    """The observations of frame ``k`` of a batch: prior queries first, then new ones by score."""
+    """The observations of frame ``k`` of a batch: prior queries first, then new ones by score.
+
+    A new query that lies on a matched prior element of its class found that element again.
+    """
     names = np.array(model.info.classes, dtype=object)
     p, v = len(slots), model.info.vertex_count
     first_prior = out["scores"].shape[1] - out["prior_score"].shape[1]
     new_scores = out["scores"][k, :first_prior]
     best = new_scores.argmax(axis=1)
     score = new_scores[np.arange(first_prior), best]
-    keep = np.flatnonzero(score >= options.score_threshold)
-    keep = keep[np.argsort(-score[keep], kind="stable")]
     existence = out["prior_score"][k, :p]
+    answered = existence >= options.existence_threshold
+    lines = out["points"][k, first_prior : first_prior + p]
+    twice = on_prior(
+        out["points"][k, :first_prior], best, lines[answered], slots.class_index[answered]
+    )
+    keep = np.flatnonzero((score >= options.score_threshold) & ~twice)
+    keep = keep[np.argsort(-score[keep], kind="stable")]
     rows = np.concatenate([first_prior + np.arange(p), keep])
-    state = np.where(existence >= options.existence_threshold, MATCHED, OUTDATED)
+    state = np.where(answered, MATCHED, OUTDATED)
     unknown = np.full(len(keep), np.nan, np.float32)
     return Observations(
         frame=np.full(len(rows), frame, np.int32),
