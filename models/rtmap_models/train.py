@@ -244,7 +244,7 @@ class Trainer:
         } | {k: round(v, 4) for k, v in means.items()}
         path = self.options.output.with_suffix(".csv")
         path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = self.rows == 0 and self.options.resume is None
+        fresh = not path.exists() or (self.rows == 0 and self.options.resume is None)
         with path.open("w" if fresh else "a", newline="", encoding="utf-8") as stream:
             writer = csv.DictWriter(stream, list(row))
             if fresh:

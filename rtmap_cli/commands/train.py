@@ -58,9 +58,10 @@ def command(
     """
     import os
 
-    if steps is None and minutes is None and frames is None:
+    training = steps is not None or minutes is not None
+    if not training and frames is None:
         raise UsageError("nothing to do: give --frames, and --steps or --minutes")
-    if output.exists() and not overwrite and resume is None:
+    if training and output.exists() and not overwrite and resume is None:
         raise UsageError(f"{output} exists; pass --overwrite or --resume")
     try:
         from rtmap_models.config import load_config
@@ -76,7 +77,7 @@ def command(
     report = (lambda line: None) if quiet else log
     if frames is not None:
         generate(sizes, folder, frames, seed, workers, report)
-    if steps is None and minutes is None:
+    if not training:
         return
     options_ = TrainOptions(
         data=folder,
