@@ -15,6 +15,7 @@ import contextlib
 import io
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -214,7 +215,9 @@ def chain_of(place: Place, kind: str, work: Path, options: argparse.Namespace) -
         for d, k in zip(drives, shared, strict=True)
     ]
     for cycle, run in enumerate(runs, start=1):
-        command("crowdsource", run, "--map", work / "map")
+        # The folder of runs grows drive by drive, as it does every night for a fleet.
+        shutil.copytree(run, work / "fleet" / run.name)
+        command("crowdsource", work / "fleet", "--map", work / "map")
         score = compare(read_map(work / "map"), place.world, judged_at, Settings())
         scores[f"cycle_{cycle}"] = percent(score)
     command("crowdsource", work / "runs", "--map", work / "batch")

@@ -181,6 +181,25 @@ def test_runs_are_known_and_never_count_twice(rtmap: Call, tmp_path: Path) -> No
     assert read_map(tmp_path / "map").by_id()["middle"].existence > existence
 
 
+def test_a_map_from_runs_alone_is_the_same_drive_by_drive_and_at_once(
+    rtmap: Call, tmp_path: Path
+) -> None:
+    growing, ids = tmp_path / "growing", []
+    for seed in (0, 1, 2):
+        _runs(street(), growing, [seed])
+        rtmap("crowdsource", growing, "--map", tmp_path / "nightly")
+        ids.append({e.element_id for e in read_map(tmp_path / "nightly")})
+    rtmap("crowdsource", growing, "--map", tmp_path / "batch")
+    nightly, batch = read_map(tmp_path / "nightly"), read_map(tmp_path / "batch")
+    # The same geometry, and every element has kept the id of its first night.
+    assert ids[0] == ids[1] == ids[2] and len(nightly) == len(batch) == 6
+    shapes = [sorted(tuple(np.round(e.xy.ravel(), 6)) for e in m) for m in (nightly, batch)]
+    assert shapes[0] == shapes[1]
+    assert all(e.traversals == 3 and e.runs == ("d0", "d1", "d2") for e in nightly)
+    told = json.loads(rtmap("crowdsource", growing, "--map", tmp_path / "nightly", "--json").out)
+    assert told["version"] == 2 and told["runs"] == []
+
+
 def test_a_dry_run_tells_and_writes_nothing(rtmap: Call, tmp_path: Path) -> None:
     write_new_map(street(), tmp_path / "map", "prior")
     _runs(street(without=["west"]), tmp_path / "runs", range(2))

@@ -42,7 +42,8 @@ def command(
     RUNS_DIR is a run or a folder of runs. Confirmed elements are moved to where prior and
     detections put them, each with its covariance; elements that runs looked at and did not find
     lose existence and go; new ones come when enough runs agree. Without the map's folder the
-    first version is made. Runs fused before are known and never count twice.
+    first version is made. Runs fused before are known and never count twice: while a map came
+    from runs alone and they all lie in RUNS_DIR, all are fused anew and elements keep their ids.
 
     \b
     Example:
@@ -73,7 +74,11 @@ def command(
         emit(result | {"counts": {}}, as_json, [f"{map_path}: all runs are in the map already"])
         return
     _tell_unlocalized([t.run_id for t in fresh if not t.localized], exists)
-    fusion = _fuse(traversals, fresh, before, crs, paths, _settings(without_sigma), done)
+    settings = _settings(without_sigma)
+    if before is not None and _rebuildable(map_path, known, traversals):
+        fusion = _rebuilt(traversals, before, crs, paths, settings)
+    else:
+        fusion = _fuse(traversals, fresh, before, crs, paths, settings, done)
     if not len(fusion.vector_map) and not exists:
         raise NoAnswer(f"{runs_dir}: the runs hold nothing that could become a map")
     if not dry_run:
@@ -138,6 +143,30 @@ def _fuse(
     prior = before if before is not None else VectorMap((), crs)
     evidence = gather_evidence(traversals, prior, classes_of(paths), settings, done)
     return fuse(prior, evidence, fresh, traversals, settings.policy, settings.fusion)
+
+
+def _rebuildable(map_path: Path, known: set[str], traversals: list[Traversal]) -> bool:
+    """True when the map came from runs alone and all of them are at hand: fused together they
+    give a better map than one after the other, and the same in any order."""
+    from rtmap_cli.maps.store import history
+
+    alone = all("crowdsource" in version.info for version in history(map_path))
+    return alone and known <= {t.run_id for t in traversals}
+
+
+def _rebuilt(
+    traversals: list[Traversal],
+    before: VectorMap,
+    crs: str,
+    paths: list[Path],
+    settings: Settings,
+) -> Fusion:
+    """All runs fused at once; elements keep their ids."""
+    from rtmap_cli.steps.crowdsource.fuse import compared
+    from rtmap_cli.steps.crowdsource.identity import keep_ids
+
+    fusion = _fuse(traversals, traversals, None, crs, paths, settings, set())
+    return compared(before, keep_ids(before, fusion.vector_map), fusion.waiting)
 
 
 def _tell_unlocalized(names: list[str], exists: bool) -> None:

@@ -74,6 +74,18 @@ def fuse(
     return out
 
 
+def compared(before: VectorMap, after: VectorMap, waiting: Sequence[str] = ()) -> Fusion:
+    """The Fusion that says what is different between two versions of a map, by ids."""
+    out = Fusion(after, waiting=list(waiting))
+    old, new = before.by_id(), after.by_id()
+    out.inserted = [name for name in new if name not in old]
+    out.deleted = [name for name in old if name not in new]
+    for name in new.keys() & old.keys():
+        same = np.array_equal(new[name].points, old[name].points, equal_nan=True)
+        (out.untouched if same else out.moved).append(name)
+    return out
+
+
 @dataclass
 class _Piece:
     """An element of the next version before its geometry is fused."""
