@@ -30,9 +30,9 @@ from rtmap_cli.logs.log import Rig
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.steps.evaluate.precision import Scorer
 from rtmap_cli.steps.infer.model import MapModel
-from rtmap_cli.steps.simulate.render import render_cameras
-from rtmap_cli.steps.simulate.style import make_style
-from rtmap_cli.steps.simulate.world import world_from_map
+from rtmap_cli.steps.simulate.images.render import render_cameras
+from rtmap_cli.steps.simulate.images.style import make_style
+from rtmap_cli.steps.simulate.worlds.world import world_from_map
 
 TEST_SEED = 90_000_000
 """Towns from this seed on are neither trained nor calibrated with."""

@@ -39,12 +39,12 @@ from rtmap_cli.steps.evaluate.drives import read_drives
 from rtmap_cli.steps.evaluate.judge import judge_poses
 from rtmap_cli.steps.evaluate.poses import pool_poses
 from rtmap_cli.steps.evaluate.precision import MapScore, Scorer
-from rtmap_cli.steps.simulate.degrade import degrade_map
-from rtmap_cli.steps.simulate.drives import drive_over_route, with_traffic
-from rtmap_cli.steps.simulate.observations import observe
-from rtmap_cli.steps.simulate.perception import DriveKey
-from rtmap_cli.steps.simulate.presets import PRESETS, Preset
-from rtmap_cli.steps.simulate.routes import KINDS, corridor, find_routes, lanes_of_av2
+from rtmap_cli.steps.simulate.driving.drives import drive_over_route, with_traffic
+from rtmap_cli.steps.simulate.driving.routes import KINDS, corridor, find_routes, lanes_of_av2
+from rtmap_cli.steps.simulate.perceiving.observations import observe
+from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+from rtmap_cli.steps.simulate.perceiving.presets import PRESETS, Preset
+from rtmap_cli.steps.simulate.worlds.degrade import degrade_map
 
 LOGS = ("7fab2350", "adcf7d18", "3bffdcff")
 PAPER = {  # RTMap, Table 1, MapTRv2 rows: crossing, divider, boundary

@@ -13,9 +13,9 @@ from rtmap_cli.geometry.polylines import length
 from rtmap_cli.maps.crs import lonlat_to
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import read_map
-from rtmap_cli.steps.simulate.changes import ChangeSpec, change_world, parse_spec
-from rtmap_cli.steps.simulate.town import Town, make_town
-from rtmap_cli.steps.simulate.world import even_odd_surface, world_from_map
+from rtmap_cli.steps.simulate.towns.town import Town, make_town
+from rtmap_cli.steps.simulate.worlds.changes import ChangeSpec, change_world, parse_spec
+from rtmap_cli.steps.simulate.worlds.world import even_odd_surface, world_from_map
 
 
 @pytest.fixture(scope="module")

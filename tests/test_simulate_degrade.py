@@ -10,7 +10,7 @@ import numpy as np
 
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import read_map, write_new_map
-from rtmap_cli.steps.simulate.degrade import smooth_error
+from rtmap_cli.steps.simulate.worlds.degrade import smooth_error
 
 ORIGIN = np.array([500_000.0, 5_400_000.0])
 

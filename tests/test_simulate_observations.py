@@ -17,13 +17,20 @@ from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED, Run, read_poses, read_run
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
-from rtmap_cli.steps.simulate.drives import Drive, drive_over_route, thinned, with_traffic
-from rtmap_cli.steps.simulate.noise import FirstOrder, generator, smooth_field
-from rtmap_cli.steps.simulate.observations import observe
-from rtmap_cli.steps.simulate.perception import DriveKey, stretch, visible_runs
-from rtmap_cli.steps.simulate.presets import PRESETS, Preset, PriorPreset, find_preset
-from rtmap_cli.steps.simulate.routes import Lane, corridor, find_routes, matches, route_of, turn
-from rtmap_cli.steps.simulate.traffic import generated_traffic
+from rtmap_cli.steps.simulate.driving.drives import Drive, drive_over_route, thinned, with_traffic
+from rtmap_cli.steps.simulate.driving.routes import (
+    Lane,
+    corridor,
+    find_routes,
+    matches,
+    route_of,
+    turn,
+)
+from rtmap_cli.steps.simulate.driving.traffic import generated_traffic
+from rtmap_cli.steps.simulate.perceiving.noise import FirstOrder, generator, smooth_field
+from rtmap_cli.steps.simulate.perceiving.observations import observe
+from rtmap_cli.steps.simulate.perceiving.perception import DriveKey, stretch, visible_runs
+from rtmap_cli.steps.simulate.perceiving.presets import PRESETS, Preset, PriorPreset, find_preset
 
 CRS = "EPSG:32632"
 X0, Y0 = 500_000.0, 5_400_000.0

@@ -11,10 +11,10 @@ from rtmap_cli.geometry.cameras import projection
 from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, transform
 from rtmap_cli.logs.log import Camera, Occluder
 from rtmap_cli.maps.element import Element, VectorMap
-from rtmap_cli.steps.simulate.render import render_cameras
-from rtmap_cli.steps.simulate.rig import default_rig, jitter_rig, scale_camera
-from rtmap_cli.steps.simulate.style import Style, make_style
-from rtmap_cli.steps.simulate.world import World, world_from_map
+from rtmap_cli.steps.simulate.images.render import render_cameras
+from rtmap_cli.steps.simulate.images.rig import default_rig, jitter_rig, scale_camera
+from rtmap_cli.steps.simulate.images.style import Style, make_style
+from rtmap_cli.steps.simulate.worlds.world import World, world_from_map
 
 E, N = 500_000.0, 5_400_000.0
 

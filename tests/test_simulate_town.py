@@ -7,10 +7,10 @@ import pytest
 import shapely
 
 from rtmap_cli.geometry.polylines import arc_length, is_ring, tangents
-from rtmap_cli.steps.simulate.drive import linked
-from rtmap_cli.steps.simulate.routes import find_routes
-from rtmap_cli.steps.simulate.town import Town, make_town
-from rtmap_cli.steps.simulate.world import even_odd_surface
+from rtmap_cli.steps.simulate.driving.drive import linked
+from rtmap_cli.steps.simulate.driving.routes import find_routes
+from rtmap_cli.steps.simulate.towns.town import Town, make_town
+from rtmap_cli.steps.simulate.worlds.world import even_odd_surface
 
 
 @pytest.fixture(scope="module")

@@ -20,11 +20,11 @@ from rtmap_cli.geometry.cameras import projection
 from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.logs.log import Rig
 from rtmap_cli.maps.crop import MapIndex
-from rtmap_cli.steps.simulate.render import render_cameras
-from rtmap_cli.steps.simulate.style import make_style
-from rtmap_cli.steps.simulate.town import Town, make_town
-from rtmap_cli.steps.simulate.world import world_from_map
-from rtmap_cli.steps.simulate.world_objects import random_occluders
+from rtmap_cli.steps.simulate.images.render import render_cameras
+from rtmap_cli.steps.simulate.images.style import make_style
+from rtmap_cli.steps.simulate.towns.town import Town, make_town
+from rtmap_cli.steps.simulate.worlds.world import world_from_map
+from rtmap_cli.steps.simulate.worlds.world_objects import random_occluders
 from rtmap_models.bev import BevWarp
 from rtmap_models.config import ModelConfig
 from rtmap_models.dataset import SCENE_MARGIN_M, window_half, window_size, write_shard

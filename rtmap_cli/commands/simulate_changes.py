@@ -67,9 +67,14 @@ def command(
 
     from rtmap_cli.errors import BadInput
     from rtmap_cli.maps.store import read_map, write_new_map
-    from rtmap_cli.steps.simulate.changes import change_world, common_path, parse_spec, truth_json
-    from rtmap_cli.steps.simulate.drive_source import Route, find_source, town_info
-    from rtmap_cli.steps.simulate.perception import DriveKey
+    from rtmap_cli.steps.simulate.driving.drive_source import Route, find_source, town_info
+    from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+    from rtmap_cli.steps.simulate.worlds.changes import (
+        change_world,
+        common_path,
+        parse_spec,
+        truth_json,
+    )
     from rtmap_cli.tables import write_json
 
     wanted = [parse_spec(text) for text in specs]

@@ -51,7 +51,7 @@ def command(
     """  # fmt: skip
     from rtmap_cli.maps.store import read_map, write_new_map
     from rtmap_cli.output import emit
-    from rtmap_cli.steps.simulate.degrade import degrade_map
+    from rtmap_cli.steps.simulate.worlds.degrade import degrade_map
 
     exact = read_map(map_path, map_version)
     degraded = degrade_map(exact, sigma, seed, correlation)

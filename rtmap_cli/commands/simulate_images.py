@@ -13,9 +13,9 @@ from rtmap_cli.output import emit, log, progress
 if TYPE_CHECKING:
     from rtmap_cli.logs.log import Rig
     from rtmap_cli.maps.element import VectorMap
-    from rtmap_cli.steps.simulate.drive_source import Source
-    from rtmap_cli.steps.simulate.drives import Drive
-    from rtmap_cli.steps.simulate.perception import DriveKey
+    from rtmap_cli.steps.simulate.driving.drive_source import Source
+    from rtmap_cli.steps.simulate.driving.drives import Drive
+    from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
 
 LOG_RATE, TOWN_SPACING = 2.0, 2.5
 POSITIVE = click.FloatRange(0, min_open=True)
@@ -126,10 +126,10 @@ def command(
       rtmap simulate images --map map --log av2:LOG_DIR --seed 1 -o log
     """  # fmt: skip
     from rtmap_cli.maps.store import read_map
-    from rtmap_cli.steps.simulate.changes import parse_spec
-    from rtmap_cli.steps.simulate.drive import first_frames
-    from rtmap_cli.steps.simulate.drive_source import TOWN, Route, find_source
-    from rtmap_cli.steps.simulate.perception import DriveKey
+    from rtmap_cli.steps.simulate.driving.drive import first_frames
+    from rtmap_cli.steps.simulate.driving.drive_source import TOWN, Route, find_source
+    from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+    from rtmap_cli.steps.simulate.worlds.changes import parse_spec
     from rtmap_cli.tables import whole_folder
 
     wanted = [parse_spec(text) for text in specs]
@@ -171,7 +171,7 @@ def _rig(source: Source, name: str | None, width: int, log_path: str) -> Rig:
     """The cameras at the wanted width."""
     from rtmap_cli.errors import BadInput
     from rtmap_cli.logs.log import Rig
-    from rtmap_cli.steps.simulate.rig import default_rig, scale_camera
+    from rtmap_cli.steps.simulate.images.rig import default_rig, scale_camera
 
     if name != "default" and source.rig is not None:
         return Rig(tuple(scale_camera(c, width) for c in source.rig))
@@ -188,7 +188,7 @@ def _changed(
     """The map of the world after --change, and the truth about it."""
     import numpy as np
 
-    from rtmap_cli.steps.simulate.changes import change_world, truth_json
+    from rtmap_cli.steps.simulate.worlds.changes import change_world, truth_json
 
     if not specs:
         return vector_map, None
@@ -211,8 +211,13 @@ def _write(
 ) -> int:
     """Render every frame into the folder; returns the number of images."""
     from rtmap_cli.logs.native import NativeLogWriter
-    from rtmap_cli.steps.simulate.drive_images import frames_of, images_of, poses_of, with_vehicles
-    from rtmap_cli.steps.simulate.world import world_from_map
+    from rtmap_cli.steps.simulate.images.drive_images import (
+        frames_of,
+        images_of,
+        poses_of,
+        with_vehicles,
+    )
+    from rtmap_cli.steps.simulate.worlds.world import world_from_map
 
     vector_map, world_map, truth = maps
     world = world_from_map(world_map, key.world_seed, surface_map=vector_map if truth else None)

@@ -13,8 +13,8 @@ from rtmap_cli.output import emit, progress
 if TYPE_CHECKING:
     from rtmap_cli.logs.run import Poses
     from rtmap_cli.maps.element import VectorMap
-    from rtmap_cli.steps.simulate.drives import Drive
-    from rtmap_cli.steps.simulate.perception import DriveKey
+    from rtmap_cli.steps.simulate.driving.drives import Drive
+    from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
 
 LOG_RATE, ROUTE_SPACING = 2.0, 2.5
 
@@ -125,10 +125,10 @@ def command(
     from rtmap_cli.logs.run import STATES, write_run
     from rtmap_cli.maps.crs import check_same_crs
     from rtmap_cli.maps.store import read_map
-    from rtmap_cli.steps.simulate.drives import thinned, with_traffic
-    from rtmap_cli.steps.simulate.observations import observe
-    from rtmap_cli.steps.simulate.perception import DriveKey
-    from rtmap_cli.steps.simulate.presets import find_preset
+    from rtmap_cli.steps.simulate.driving.drives import thinned, with_traffic
+    from rtmap_cli.steps.simulate.perceiving.observations import observe
+    from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+    from rtmap_cli.steps.simulate.perceiving.presets import find_preset
     from rtmap_cli.tables import whole_folder
 
     model = find_preset(preset)
@@ -186,8 +186,8 @@ def _drive(
     from rtmap_cli.formats.av2_map import read_av2_archive
     from rtmap_cli.logs.native import NativeLog
     from rtmap_cli.logs.open import log_format, open_log
-    from rtmap_cli.steps.simulate.drives import drive_of_log, drive_over_route
-    from rtmap_cli.steps.simulate.routes import lanes_of_av2, route_of
+    from rtmap_cli.steps.simulate.driving.drives import drive_of_log, drive_over_route
+    from rtmap_cli.steps.simulate.driving.routes import lanes_of_av2, route_of
 
     said = {"route": route, "lateral": lateral, "spacing": spacing, "rate": rate}
     if route is not None:

@@ -34,7 +34,7 @@ def command(seed: int, size: float, output: Path, overwrite: bool, as_json: bool
     """
     from rtmap_cli.maps.element import CLASSES
     from rtmap_cli.maps.store import write_new_map
-    from rtmap_cli.steps.simulate.town import make_town
+    from rtmap_cli.steps.simulate.towns.town import make_town
 
     town = make_town(seed, size)
     info = {"town": {"seed": seed, "size": size}}

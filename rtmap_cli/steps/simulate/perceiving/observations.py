@@ -13,8 +13,8 @@ from rtmap_cli.logs.log import Occluder
 from rtmap_cli.logs.run import OCCLUDERS, Observations, Poses, Run, run_info, true_poses
 from rtmap_cli.maps.crop import DEFAULT_RANGE, Range
 from rtmap_cli.maps.element import CLASSES, VectorMap
-from rtmap_cli.steps.simulate.drives import Drive, initial_poses
-from rtmap_cli.steps.simulate.perception import (
+from rtmap_cli.steps.simulate.driving.drives import Drive, initial_poses
+from rtmap_cli.steps.simulate.perceiving.perception import (
     VERTICES,
     Detection,
     DriveKey,
@@ -22,8 +22,8 @@ from rtmap_cli.steps.simulate.perception import (
     Perception,
     View,
 )
-from rtmap_cli.steps.simulate.presets import Preset
-from rtmap_cli.steps.simulate.prior_queries import PriorPerception
+from rtmap_cli.steps.simulate.perceiving.presets import Preset
+from rtmap_cli.steps.simulate.perceiving.prior_queries import PriorPerception
 
 Progress = Callable[[Iterable[int]], Iterator[int]]
 

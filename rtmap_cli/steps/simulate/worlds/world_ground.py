@@ -16,7 +16,7 @@ import shapely
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from rtmap_cli.steps.simulate.world import World
+    from rtmap_cli.steps.simulate.worlds.world import World
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

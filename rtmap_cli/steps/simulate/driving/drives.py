@@ -13,10 +13,10 @@ from rtmap_cli.geometry.polylines import arc_length
 from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, wrap_angle, xyyaw_of
 from rtmap_cli.logs.log import Log, Occluder
 from rtmap_cli.logs.run import Poses, RunFrames
-from rtmap_cli.steps.simulate.noise import first_order_walk, generator
-from rtmap_cli.steps.simulate.perception import DriveKey
-from rtmap_cli.steps.simulate.presets import Preset
-from rtmap_cli.steps.simulate.traffic import generated_traffic
+from rtmap_cli.steps.simulate.driving.traffic import generated_traffic
+from rtmap_cli.steps.simulate.perceiving.noise import first_order_walk, generator
+from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+from rtmap_cli.steps.simulate.perceiving.presets import Preset
 
 Array = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.logs.log import Camera, Occluder
-from rtmap_cli.steps.simulate.style import Style
-from rtmap_cli.steps.simulate.world_objects import CROWN, OBJECT_COLUMNS, objects_near
+from rtmap_cli.steps.simulate.images.style import Style
+from rtmap_cli.steps.simulate.worlds.world_objects import CROWN, OBJECT_COLUMNS, objects_near
 
 if TYPE_CHECKING:
-    from rtmap_cli.steps.simulate.world import World
+    from rtmap_cli.steps.simulate.worlds.world import World
 
 Array = NDArray[np.float64]
 

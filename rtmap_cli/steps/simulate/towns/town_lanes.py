@@ -9,10 +9,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from rtmap_cli.steps.simulate.town_streets import Street
+from rtmap_cli.steps.simulate.towns.town_streets import Street
 
 if TYPE_CHECKING:
-    from rtmap_cli.steps.simulate.town import Junction
+    from rtmap_cli.steps.simulate.towns.town import Junction
 
 Array = NDArray[np.float64]
 

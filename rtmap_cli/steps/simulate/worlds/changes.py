@@ -16,7 +16,7 @@ from rtmap_cli.errors import NoAnswer, UsageError
 from rtmap_cli.geometry.polylines import arc_length, is_ring, normals, tangents
 from rtmap_cli.maps.crs import to_lonlat
 from rtmap_cli.maps.element import CLASSES, RING_CLASSES, Element, VectorMap
-from rtmap_cli.steps.simulate.world import even_odd_surface
+from rtmap_cli.steps.simulate.worlds.world import even_odd_surface
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import length, resample_step
 from rtmap_cli.maps.element import Element, VectorMap
-from rtmap_cli.steps.simulate.town_lanes import lane_network
-from rtmap_cli.steps.simulate.town_streets import Street, lay_streets
+from rtmap_cli.steps.simulate.towns.town_lanes import lane_network
+from rtmap_cli.steps.simulate.towns.town_streets import Street, lay_streets
 
 Array = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.poses import xyyaw_of
 from rtmap_cli.logs.log import Camera, Occluder
-from rtmap_cli.steps.simulate.render_boxes import draw_boxes, scene_boxes
-from rtmap_cli.steps.simulate.style import Style
-from rtmap_cli.steps.simulate.world import World
-from rtmap_cli.steps.simulate.world_ground import ground_window, noise_fields, opencv
+from rtmap_cli.steps.simulate.images.render_boxes import draw_boxes, scene_boxes
+from rtmap_cli.steps.simulate.images.style import Style
+from rtmap_cli.steps.simulate.worlds.world import World
+from rtmap_cli.steps.simulate.worlds.world_ground import ground_window, noise_fields, opencv
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

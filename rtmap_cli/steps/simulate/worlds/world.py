@@ -70,7 +70,7 @@ def world_from_map(
     width = float(rng.uniform(0.3, 0.55))
     for element in vector_map.of_class("ped_crossing"):
         paint += _crossing_paint(element, width, seed)
-    from rtmap_cli.steps.simulate.world_objects import roadside
+    from rtmap_cli.steps.simulate.worlds.world_objects import roadside
 
     return World(vector_map, surface, curbs, gaps, paint, roadside(surface, seed), seed)
 

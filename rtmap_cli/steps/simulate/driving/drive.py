@@ -20,12 +20,12 @@ from rtmap_cli.geometry.polylines import arc_length
 from rtmap_cli.geometry.poses import xyyaw_of
 from rtmap_cli.logs.log import Occluder
 from rtmap_cli.maps.element import VectorMap
-from rtmap_cli.steps.simulate.drives import Drive, drive_over_route, thinned
-from rtmap_cli.steps.simulate.noise import generator
-from rtmap_cli.steps.simulate.perception import DriveKey
-from rtmap_cli.steps.simulate.routes import Lane, route_of
-from rtmap_cli.steps.simulate.town import make_town
-from rtmap_cli.steps.simulate.world_objects import random_vehicle
+from rtmap_cli.steps.simulate.driving.drives import Drive, drive_over_route, thinned
+from rtmap_cli.steps.simulate.driving.routes import Lane, route_of
+from rtmap_cli.steps.simulate.perceiving.noise import generator
+from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+from rtmap_cli.steps.simulate.towns.town import make_town
+from rtmap_cli.steps.simulate.worlds.world_objects import random_vehicle
 
 Array = NDArray[np.float64]
 

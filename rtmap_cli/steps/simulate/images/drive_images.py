@@ -10,18 +10,18 @@ import numpy as np
 
 from rtmap_cli.logs.log import Frame, Rig
 from rtmap_cli.logs.run import Poses
-from rtmap_cli.steps.simulate.drive import lane_traffic
-from rtmap_cli.steps.simulate.drives import Drive, initial_poses, with_traffic
-from rtmap_cli.steps.simulate.noise import generator
-from rtmap_cli.steps.simulate.perception import DriveKey
-from rtmap_cli.steps.simulate.presets import Preset
-from rtmap_cli.steps.simulate.render import render_cameras
-from rtmap_cli.steps.simulate.style import make_style
-from rtmap_cli.steps.simulate.world import World
-from rtmap_cli.steps.simulate.world_ground import opencv
+from rtmap_cli.steps.simulate.driving.drive import lane_traffic
+from rtmap_cli.steps.simulate.driving.drives import Drive, initial_poses, with_traffic
+from rtmap_cli.steps.simulate.images.render import render_cameras
+from rtmap_cli.steps.simulate.images.style import make_style
+from rtmap_cli.steps.simulate.perceiving.noise import generator
+from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+from rtmap_cli.steps.simulate.perceiving.presets import Preset
+from rtmap_cli.steps.simulate.worlds.world import World
+from rtmap_cli.steps.simulate.worlds.world_ground import opencv
 
 if TYPE_CHECKING:
-    from rtmap_cli.steps.simulate.drive_source import Source
+    from rtmap_cli.steps.simulate.driving.drive_source import Source
 
 
 def with_vehicles(

@@ -25,8 +25,9 @@ from rtmap_cli.logs.run import MATCHED, OUTDATED
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import CLASSES, RING_CLASSES, VectorMap
 from rtmap_cli.maps.prior import PriorSlots, prior_slots
-from rtmap_cli.steps.simulate.noise import FirstOrder, generator
-from rtmap_cli.steps.simulate.perception import (
+from rtmap_cli.steps.simulate.driving.traffic import visible
+from rtmap_cli.steps.simulate.perceiving.noise import FirstOrder, generator
+from rtmap_cli.steps.simulate.perceiving.perception import (
     VERTICES,
     Detection,
     Perception,
@@ -35,7 +36,6 @@ from rtmap_cli.steps.simulate.perception import (
     sigmoid,
     stretch,
 )
-from rtmap_cli.steps.simulate.traffic import visible
 
 Array = NDArray[np.float64]
 

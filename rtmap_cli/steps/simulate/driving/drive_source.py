@@ -16,11 +16,11 @@ from rtmap_cli.logs.open import open_log
 from rtmap_cli.maps.crs import check_same_crs
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import history
-from rtmap_cli.steps.simulate.drive import town_drive, town_lanes
-from rtmap_cli.steps.simulate.drives import Drive, drive_of_log
-from rtmap_cli.steps.simulate.perception import DriveKey
-from rtmap_cli.steps.simulate.routes import Lane
-from rtmap_cli.steps.simulate.world import even_odd_surface
+from rtmap_cli.steps.simulate.driving.drive import town_drive, town_lanes
+from rtmap_cli.steps.simulate.driving.drives import Drive, drive_of_log
+from rtmap_cli.steps.simulate.driving.routes import Lane
+from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+from rtmap_cli.steps.simulate.worlds.world import even_odd_surface
 
 Array = NDArray[np.float64]
 

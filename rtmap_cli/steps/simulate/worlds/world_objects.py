@@ -12,7 +12,7 @@ from rtmap_cli.geometry.poses import transform, xyyaw_of
 from rtmap_cli.logs.log import Occluder
 
 if TYPE_CHECKING:
-    from rtmap_cli.steps.simulate.world import World
+    from rtmap_cli.steps.simulate.worlds.world import World
 
 Array = NDArray[np.float64]
 

@@ -24,9 +24,9 @@ from rtmap_cli.logs.log import Occluder
 from rtmap_cli.logs.run import NEW
 from rtmap_cli.maps.crop import DEFAULT_RANGE, MapIndex, Range
 from rtmap_cli.maps.element import CLASSES, RING_CLASSES, Element, VectorMap
-from rtmap_cli.steps.simulate.noise import FirstOrder, generator, smooth_field
-from rtmap_cli.steps.simulate.presets import Preset
-from rtmap_cli.steps.simulate.traffic import visible
+from rtmap_cli.steps.simulate.driving.traffic import visible
+from rtmap_cli.steps.simulate.perceiving.noise import FirstOrder, generator, smooth_field
+from rtmap_cli.steps.simulate.perceiving.presets import Preset
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""Where drives go: routes, lanes, traffic, GNSS and odometry errors."""

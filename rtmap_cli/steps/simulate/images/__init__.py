@@ -1,0 +1,1 @@
+"""What the cameras of a drive see: rigs, styles, rendering."""

@@ -1,0 +1,1 @@
+"""What a network would have answered: observations without images."""

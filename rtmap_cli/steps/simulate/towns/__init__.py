@@ -1,0 +1,1 @@
+"""Procedural towns: streets, junctions, lanes, paint."""
