@@ -75,7 +75,7 @@ def command(
         return
     _tell_unlocalized([t.run_id for t in fresh if not t.localized], exists)
     settings = _settings(without_sigma)
-    if before is not None and _rebuildable(map_path, known, traversals):
+    if before is not None and not force and _rebuildable(map_path, known, traversals):
         fusion = _rebuilt(traversals, before, crs, paths, settings)
     else:
         fusion = _fuse(traversals, fresh, before, crs, paths, settings, done)
