@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from typing import Any
 
@@ -142,8 +143,15 @@ def run(arguments: list[str] | None = None) -> int:
         sys.stderr.close()
         return 0
     except OSError as error:
-        where = error.filename or "file system"
-        click.echo(f"rtmap: {where}: {error.strerror or error}; nothing was written", err=True)
+        where = error.filename2 or error.filename or "file system"
+        click.echo(f"rtmap: {where}: {error.strerror or error}", err=True)
+        return 3
+    except Exception as error:
+        if os.environ.get("RTMAP_DEBUG"):
+            raise
+        what = f"{type(error).__name__}: {error}".splitlines()[0]
+        hint = "check the input; if it is right this is a bug, RTMAP_DEBUG=1 shows where"
+        click.echo(f"rtmap: cannot go on ({what}); {hint}", err=True)
         return 3
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,18 @@ from typing import Any
 import click
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+class FiniteRange(click.FloatRange):
+    """A number in a range; nan and inf are no numbers here."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """As FloatRange, and finite."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number", param, ctx)
+        return number
+
 
 # Existence is checked by the readers, which exit with 3 and say what to do.
 PATH = click.Path(path_type=Path)
@@ -26,7 +39,11 @@ as_json: Decorator = click.option(
     "--json", "as_json", is_flag=True, help="Print the result as one JSON object."
 )
 seed: Decorator = click.option(
-    "--seed", type=int, default=0, show_default=True, help="Seed of every random choice."
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Seed of every random choice.",
 )
 crs: Decorator = click.option(
     "--crs", help="Projected metric CRS of the map frame, e.g. EPSG:32617."

@@ -47,6 +47,8 @@ class TableSchema:
 def whole_file(path: str | Path) -> Iterator[Path]:
     """A temporary path beside ``path`` that replaces it when the block ends without an error."""
     path = Path(path)
+    if path.is_dir():
+        raise BadInput(path, "is a folder, not a file", "choose another output")
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     os.close(handle)
@@ -80,6 +82,7 @@ def whole_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
         os.umask(umask)
         temporary.chmod(0o777 & ~umask)
         if path.exists():
+            _check_same_kind(path, temporary)
             retired = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
             path.replace(retired / "old")
             temporary.replace(path)
@@ -89,6 +92,36 @@ def whole_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     finally:
         if temporary.exists():
             shutil.rmtree(temporary)
+
+
+MARKERS = ("run.json", "log.json", "_delta_log")
+"""What tells a run, a log and a map from any other folder."""
+
+
+def _check_same_kind(old: Path, new: Path) -> None:
+    """BadInput unless ``old`` is empty or of the kind of folder that ``new`` is."""
+    if old.is_dir() and not any(old.iterdir()):
+        return
+    kind = [name for name in MARKERS if (new / name).exists()]
+    if not old.is_dir() or not all((old / name).exists() for name in kind):
+        raise BadInput(old, "is something else than what would replace it", "choose another output")
+
+
+def refuse_inside(output: Path, *inputs: Path | None) -> None:
+    """BadInput when an output file would lie inside (or be) one of the inputs."""
+    place = output.resolve()
+    for path in inputs:
+        if path is not None and (place == path.resolve() or path.resolve() in place.parents):
+            raise BadInput(output, f"lies inside the input {path}", "choose another output")
+
+
+def refuse_over(output: Path, *inputs: Path) -> None:
+    """BadInput when an output folder is one of the inputs, holds one, or lies in one."""
+    place = output.resolve()
+    for path in inputs:
+        old = path.resolve()
+        if place == old or place in old.parents or old in place.parents:
+            raise BadInput(output, f"would replace the input {path}", "choose another output")
 
 
 def write_table(
@@ -140,7 +173,12 @@ def read_table(path: str | Path, schema: TableSchema) -> pa.Table:
     missing = [n for n in schema.columns.names if n not in table.schema.names]
     if missing:
         raise BadInput(path, f"column {', '.join(missing)} is missing")
-    return table
+    try:
+        typed = schema.columns.with_metadata(table.schema.metadata)
+        return table.select(schema.columns.names).cast(typed)
+    except pa.ArrowException as error:
+        first = str(error).splitlines()[0]
+        raise BadInput(path, f"a column has another type than {schema.name} ({first})") from None
 
 
 def table_metadata(table: pa.Table) -> dict[str, str]:
@@ -168,5 +206,5 @@ def read_json(path: str | Path) -> Any:
             with gzip.open(path, "rt", encoding="utf-8") as file:
                 return json.load(file)
         return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError, EOFError, zlib.error) as error:
+    except (ValueError, OSError, EOFError, RecursionError, zlib.error) as error:
         raise BadInput(path, f"cannot be read as JSON ({error})") from None

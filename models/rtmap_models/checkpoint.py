@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,15 @@ def load_checkpoint(path: Path) -> tuple[ModelConfig, dict[str, Any]]:
         raise BadInput(path, "no such file", "give the weights that rtmap train wrote")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, ValueError, LookupError, EOFError, OSError, pickle.PickleError) as error:
+    except (
+        RuntimeError,
+        ValueError,
+        LookupError,
+        EOFError,
+        OSError,
+        pickle.PickleError,
+        struct.error,
+    ) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadInput(path, f"not a checkpoint: {first}", "train again") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:

@@ -34,7 +34,13 @@ from rtmap_cli import options
     help="Frames per drive, 2.5 m apart.",
 )
 @click.option("--model", default="rtmap-tiny", show_default=True, help="Zoo name or .onnx file.")
-@click.option("--seed", type=int, default=2014, show_default=True, help="Seed of town and drives.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=2014,
+    show_default=True,
+    help="Seed of town and drives.",
+)
 @options.overwrite
 @options.as_json
 def command(

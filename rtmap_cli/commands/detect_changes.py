@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @options.output("GeoJSON file to write; - for stdout.")
 @click.option(
     "--min-probability",
-    type=click.FloatRange(0, 1),
+    type=options.FiniteRange(0, 1),
     default=0.5,
     show_default=True,
     help="Leave out less probable changes.",
@@ -62,12 +62,15 @@ def command(
     from rtmap_cli.output import emit, log
     from rtmap_cli.steps.detect_changes.events import change_events
     from rtmap_cli.steps.detect_changes.evidence import gather_evidence
+    from rtmap_cli.tables import refuse_inside
 
     stream = str(output) == "-"
     if stream and as_json:
         raise UsageError("--json and -o - both want stdout: choose one")
     if not stream and output.exists() and not overwrite:
         raise BadInput(output, "exists already", "choose another output or pass --overwrite")
+    if not stream:
+        refuse_inside(output, map_path)
     prior = read_map(map_path, map_version)
     traversals, _ = read_traversals(runs, prior.crs)
     classes = classes_of(runs)

@@ -15,12 +15,12 @@ from rtmap_cli import options
 @click.option("--truth", type=options.PATH, required=True, help="The true changes.")
 @click.option(
     "--min-probability",
-    type=click.FloatRange(0, 1),
+    type=options.FiniteRange(0, 1),
     default=0.0,
     show_default=True,
     help="Leave out detected changes that are less probable.",
 )
-@click.option("--km", type=click.FloatRange(0, min_open=True), help="Kilometres driven.")
+@click.option("--km", type=options.FiniteRange(0, min_open=True), help="Kilometres driven.")
 @click.option("--poses", help="Poses of the drives: false changes per km, frame-level accuracy.")
 @click.option("--traversal", help="Which drive of a fleet poses file (default: all).")
 @click.option(

@@ -40,7 +40,7 @@ PROTOCOLS = ("rtmap", "maptr", "streammapnet")
 )
 @click.option(
     "--cells",
-    type=click.FloatRange(1),
+    type=options.FiniteRange(1),
     help="Compare two maps as a whole, by cells of this edge (m), not by frames.",
 )
 @options.map_version

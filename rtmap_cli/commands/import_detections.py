@@ -14,7 +14,7 @@ from rtmap_cli import options
 @options.output("The run folder to write.")
 @click.option(
     "--sigma",
-    type=click.FloatRange(0, min_open=True),
+    type=options.FiniteRange(0, min_open=True),
     help="Standard deviation (m) assumed for detections that bring none.",
 )
 @options.overwrite

@@ -18,14 +18,14 @@ from rtmap_cli.output import emit, log, progress
 @click.option("--model", default="rtmap-tiny", show_default=True, help="Zoo name or .onnx file.")
 @click.option(
     "--score-threshold",
-    type=click.FloatRange(0, 1),
+    type=options.FiniteRange(0, 1),
     default=0.05,
     show_default=True,
     help="Drop new elements below this score.",
 )
 @click.option(
     "--existence-threshold",
-    type=click.FloatRange(0, 1),
+    type=options.FiniteRange(0, 1),
     default=0.5,
     show_default=True,
     help="Prior elements below this are outdated.",

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @click.option("--with", "other", type=options.PATH, help="Take AFTER from this map folder.")
 @click.option(
     "--tolerance",
-    type=click.FloatRange(0),
+    type=options.FiniteRange(0),
     default=1e-3,
     show_default=True,
     help="Metres below which geometry counts as the same.",
@@ -54,12 +54,15 @@ def command(
     from rtmap_cli.maps.difference import compare_maps, count_kinds
     from rtmap_cli.maps.store import read_map
     from rtmap_cli.output import emit, log, table
+    from rtmap_cli.tables import refuse_inside
 
     stream = str(output) == "-"
     if stream and as_json:
         raise UsageError("--json and -o - both want stdout: choose one")
     if output is not None and not stream and output.exists() and not overwrite:
         raise BadInput(output, "exists already", "choose another output or pass --overwrite")
+    if output is not None and not stream:
+        refuse_inside(output, map_path, other)
     old, new = read_map(map_path, before), read_map(other or map_path, after)
     check_same_crs(new.crs, old.crs, other or map_path)
     found = compare_maps(old, new, tolerance)

@@ -19,7 +19,7 @@ from rtmap_cli import options
 )
 @click.option(
     "--older-than",
-    type=click.FloatRange(0),
+    type=options.FiniteRange(0),
     default=60.0,
     show_default=True,
     metavar="MINUTES",

@@ -23,9 +23,9 @@ from rtmap_cli.output import emit
               help="Number of the drive through the town.")  # fmt: skip
 @click.option("--route", type=click.Choice(["straight", "turning"]), default="turning",
               show_default=True, help="Kind of the drive through the town.")  # fmt: skip
-@click.option("--length", type=click.FloatRange(20), default=160.0, show_default=True,
+@click.option("--length", type=options.FiniteRange(20), default=160.0, show_default=True,
               help="Length of the drive through the town (m).")  # fmt: skip
-@click.option("--world-seed", type=int, default=0, show_default=True,
+@click.option("--world-seed", type=click.IntRange(0), default=0, show_default=True,
               help="Seed of the corridor of the town's drives.")  # fmt: skip
 @click.option(
     "--outdate",
@@ -75,11 +75,14 @@ def command(
         parse_spec,
         truth_json,
     )
-    from rtmap_cli.tables import write_json
+    from rtmap_cli.tables import refuse_over, write_json
 
     wanted = [parse_spec(text) for text in specs]
     if truth is not None and truth.exists() and not overwrite:
         raise BadInput(truth, "exists already", "choose another --truth or pass --overwrite")
+    refuse_over(output, map_path)
+    if truth is not None and truth.is_dir():
+        raise BadInput(truth, "is a folder, not a file", "choose another --truth")
     old = read_map(map_path, map_version)
     path = None
     if near:

@@ -14,14 +14,14 @@ from rtmap_cli import options
 @options.map_version
 @click.option(
     "--sigma",
-    type=click.FloatRange(0, min_open=True),
+    type=options.FiniteRange(0, min_open=True),
     default=0.15,
     show_default=True,
     help="Standard deviation of the error, metres per axis.",
 )
 @click.option(
     "--correlation",
-    type=click.FloatRange(0, min_open=True),
+    type=options.FiniteRange(0, min_open=True),
     default=12.0,
     show_default=True,
     help="Distance over which errors are alike, metres.",
@@ -52,7 +52,9 @@ def command(
     from rtmap_cli.maps.store import read_map, write_new_map
     from rtmap_cli.output import emit
     from rtmap_cli.steps.simulate.worlds.degrade import degrade_map
+    from rtmap_cli.tables import refuse_over
 
+    refuse_over(output, map_path)
     exact = read_map(map_path, map_version)
     degraded = degrade_map(exact, sigma, seed, correlation)
     message = f"simulate degrade: sigma {sigma:g} m, seed {seed}"

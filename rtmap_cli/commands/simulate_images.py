@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
 
 LOG_RATE, TOWN_SPACING = 2.0, 2.5
-POSITIVE = click.FloatRange(0, min_open=True)
+POSITIVE = options.FiniteRange(0, min_open=True)
 
 
 @click.command("images")
@@ -33,7 +33,7 @@ POSITIVE = click.FloatRange(0, min_open=True)
 @options.seed
 @click.option(
     "--world-seed",
-    type=int,
+    type=click.IntRange(0),
     default=0,
     show_default=True,
     help="Seed of what stays in place over all drives: wear, houses, the corridor.",
@@ -54,7 +54,7 @@ POSITIVE = click.FloatRange(0, min_open=True)
 )
 @click.option(
     "--length",
-    type=click.FloatRange(20),
+    type=options.FiniteRange(20),
     default=160.0,
     show_default=True,
     help="Length of a drive through a town (m).",
@@ -130,10 +130,11 @@ def command(
     from rtmap_cli.steps.simulate.driving.drive_source import TOWN, Route, find_source
     from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
     from rtmap_cli.steps.simulate.worlds.changes import parse_spec
-    from rtmap_cli.tables import whole_folder
+    from rtmap_cli.tables import refuse_over, whole_folder
 
     wanted = [parse_spec(text) for text in specs]
     in_town = log_path.startswith(TOWN)
+    refuse_over(output, map_path, Path(log_path.partition(":")[2] or log_path))
     vector_map = read_map(map_path, map_version)
     key = DriveKey(world_seed, seed, drive)
     way = Route(route, length, spacing or TOWN_SPACING)

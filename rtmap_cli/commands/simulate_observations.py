@@ -32,7 +32,7 @@ LOG_RATE, ROUTE_SPACING = 2.0, 2.5
 @options.seed
 @click.option(
     "--world-seed",
-    type=int,
+    type=click.IntRange(0),
     default=0,
     show_default=True,
     help="Seed of what stays in place over all drives: worn paint, errors of places.",
@@ -57,18 +57,18 @@ LOG_RATE, ROUTE_SPACING = 2.0, 2.5
 )
 @click.option(
     "--route-length",
-    type=click.FloatRange(20),
+    type=options.FiniteRange(20),
     default=180.0,
     show_default=True,
     help="Length of the route (m).",
 )
 @click.option(
     "--spacing",
-    type=click.FloatRange(0, min_open=True),
+    type=options.FiniteRange(0, min_open=True),
     help="Metres between frames [default: 2.5 on a route].",
 )
 @click.option(
-    "--rate", type=click.FloatRange(0, min_open=True), help="Frames per second [default: 2]."
+    "--rate", type=options.FiniteRange(0, min_open=True), help="Frames per second [default: 2]."
 )
 @click.option(
     "--lateral",
@@ -129,10 +129,11 @@ def command(
     from rtmap_cli.steps.simulate.perceiving.observations import observe
     from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
     from rtmap_cli.steps.simulate.perceiving.presets import find_preset
-    from rtmap_cli.tables import whole_folder
+    from rtmap_cli.tables import refuse_over, whole_folder
 
     model = find_preset(preset)
     key = DriveKey(world_seed, seed, traversal)
+    refuse_over(output, map_path, Path(log_path.partition(":")[2] or log_path))
     world = read_map(map_path, map_version)
     prior = read_map(prior_path) if prior_path is not None else None
     drive, source = _drive(log_path, route, route_length, spacing, rate, lateral, key)

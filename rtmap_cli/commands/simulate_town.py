@@ -14,7 +14,7 @@ from rtmap_cli.output import emit
 @options.seed
 @click.option(
     "--size",
-    type=click.FloatRange(120, 2000),
+    type=options.FiniteRange(120, 2000),
     default=420.0,
     show_default=True,
     help="Width of the town (m).",

@@ -26,7 +26,7 @@ NEEDS = "training needs the extra 'train': pip install 'rtmap[train,simulate]'"
     help="Render procedural towns until the folder holds this many frames.",
 )
 @click.option("--steps", type=click.IntRange(1), help="Train this many steps (reproducible).")
-@click.option("--minutes", type=click.FloatRange(0, min_open=True), help="Or train this long.")
+@click.option("--minutes", type=options.FiniteRange(0, min_open=True), help="Or train this long.")
 @click.option("--batch", type=click.IntRange(1), default=8, show_default=True, help="Per thread.")
 @click.option("--resume", type=options.PATH, help="Go on from these weights.")
 @options.seed

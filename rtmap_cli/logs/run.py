@@ -329,6 +329,8 @@ def _rows(lists: Any, shape: tuple[int, ...], dtype: Any) -> Any:
     valid = np.asarray(array.is_valid())
     if valid.any():
         flat = array.drop_null().flatten().to_numpy(zero_copy_only=False)
+        if len(flat) != size * int(valid.sum()):
+            raise BadInput("list column", f"a row does not hold {size} numbers")
         out[valid] = flat.reshape(-1, size)
     return out.reshape(len(array), *shape)
 
@@ -415,9 +417,9 @@ def read_observations(folder: Path) -> Observations:
         points = _rows(table["points"], (v, 2), np.float32)
         sigma = _rows(table["sigma"], (v, 2), np.float32)
         prior_points = _rows(table["prior_points"], (v, 2), np.float64)
-    except ValueError:
+    except BadInput:
         raise BadInput(path, f"a row does not hold {v} vertices") from None
-    if not np.isfinite(points).all() or not (sigma > 0).all():
+    if not np.isfinite(points).all() or not (np.isfinite(sigma) & (sigma > 0)).all():
         raise BadInput(path, "points must be finite and sigma above zero")
     codes = {name: k for k, name in enumerate(STATES)}
     states = table["state"].to_pylist()
@@ -461,12 +463,19 @@ def read_poses(path: Path) -> Poses:
     """Read a poses.parquet file (of a run, or true poses of a simulated log)."""
     table = read_table(path, POSES)
     methods = table["method"].to_pylist()
+    covariance = _rows(table["covariance"], (6, 6), np.float64)
+    spread = covariance[:, range(6), range(6)]
+    if not ((spread >= 0) | np.isnan(spread)).all():
+        raise BadInput(path, "a covariance has a negative or infinite variance")
+    states = set(table["status"].to_pylist())
+    if not states <= set(POSE_STATUS):
+        raise BadInput(path, f"unknown status {sorted(map(str, states - set(POSE_STATUS)))[0]}")
     return Poses(
         frame=_column(table, "frame").astype(np.int32),
         timestamp_ns=_column(table, "timestamp_ns").astype(np.int64),
         method=methods[0] if methods else "none",
         pose=_pose_of(table, path),
-        covariance=_rows(table["covariance"], (6, 6), np.float64),
+        covariance=covariance,
         eigenvalues=_rows(table["eigenvalues"], (3,), np.float64),
         weakest_direction=_rows(table["weakest_direction"], (3,), np.float64),
         residual_count=_column(table, "residual_count").astype(np.int32),
@@ -503,6 +512,16 @@ def write_run(run: Run, folder: Path) -> None:
         write_poses(run.poses, folder, run.crs)
 
 
+def _rising(pair: Any) -> bool:
+    """True for two finite numbers, the second one larger."""
+    return (
+        isinstance(pair, list)
+        and len(pair) == 2
+        and all(isinstance(v, int | float) and abs(v) < 1e6 for v in pair)
+        and pair[0] < pair[1]
+    )
+
+
 def read_run_info(folder: str | Path) -> dict[str, Any]:
     """run.json of a run folder, checked."""
     folder = Path(folder)
@@ -519,6 +538,14 @@ def read_run_info(folder: str | Path) -> dict[str, Any]:
     for key in ("log_id", "crs", "classes", "range_m"):
         if key not in info:
             raise BadInput(folder / "run.json", f"{key} is missing")
+    for key in ("log_id", "crs"):
+        if not isinstance(info[key], str) or not info[key]:
+            raise BadInput(folder / "run.json", f"{key} must be a text")
+    names, box = info["classes"], info["range_m"]
+    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        raise BadInput(folder / "run.json", "classes must be a list of texts")
+    if not isinstance(box, dict) or not all(_rising(box.get(axis)) for axis in "xy"):
+        raise BadInput(folder / "run.json", "range_m must hold x and y, each two rising metres")
     return info
 
 

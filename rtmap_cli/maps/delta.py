@@ -151,6 +151,8 @@ def read_properties(place: Place, table: Any) -> dict[str, Any]:
             f"map version {found} is unknown to this rtmap (it reads {MAP_VERSION})",
             "use the rtmap that wrote it, or a newer one",
         )
+    if not isinstance(properties.get("crs"), str):
+        raise BadInput(place.root, "the map's description names no CRS")
     return properties
 
 

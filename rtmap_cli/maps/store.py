@@ -264,6 +264,8 @@ def gc(
     else:
         first = max(0, latest - keep + 1)
         needed = {n for v in range(first, latest + 1) for n in tile_files(open_table(place, v))}
+    for name in needed:
+        place.file(name)  # a log that names files elsewhere is not to be trusted with removals
     removed = []
     for name, size, age in place.data_files():
         if name not in needed and age >= min_age_s:
