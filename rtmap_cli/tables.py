@@ -10,9 +10,9 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,11 @@ from rtmap_cli.errors import BadInput
 
 @dataclass(frozen=True)
 class TableSchema:
-    """Name, version and columns of one kind of Parquet file."""
+    """Name, version and columns of one kind of Parquet file.
+
+    ``defaults``: columns that came with a later minor version, and what older files mean by
+    lacking them.
+    """
 
     name: str
     version: str
@@ -32,6 +36,7 @@ class TableSchema:
     frame: str = ""
     units: str = ""
     description: str = ""
+    defaults: Mapping[str, Any] = field(default_factory=dict)
 
     def metadata(self, extra: dict[str, str] | None = None) -> dict[str, str]:
         """The metadata written into the file."""
@@ -171,8 +176,10 @@ def read_table(path: str | Path, schema: TableSchema) -> pa.Table:
         ) from None
     check_schema(table.schema.metadata, path, schema)
     missing = [n for n in schema.columns.names if n not in table.schema.names]
-    if missing:
-        raise BadInput(path, f"column {', '.join(missing)} is missing")
+    if unknown := [n for n in missing if n not in schema.defaults]:
+        raise BadInput(path, f"column {', '.join(unknown)} is missing")
+    for name in missing:
+        table = table.append_column(name, pa.array([schema.defaults[name]] * len(table)))
     try:
         typed = schema.columns.with_metadata(table.schema.metadata)
         return table.select(schema.columns.names).cast(typed)

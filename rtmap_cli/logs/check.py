@@ -36,7 +36,7 @@ from rtmap_cli.logs.tables import (
     numbers,
     rig_of_table,
 )
-from rtmap_cli.maps.crs import check_map_crs
+from rtmap_cli.maps.crs import check_log_crs
 from rtmap_cli.tables import TableSchema, read_json
 
 T = TypeVar("T")
@@ -88,7 +88,7 @@ def _check_info(report: Report) -> str | None:
         report.warning(
             path, f"the road lies {info['ground_z']:g} m above the ego origin", "is ground_z right?"
         )
-    return _attempt(report, lambda: check_map_crs(str(info["crs"]), path))
+    return _attempt(report, lambda: check_log_crs(str(info["crs"]), path))
 
 
 def _check_rig(report: Report) -> Rig | None:

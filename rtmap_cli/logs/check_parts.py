@@ -209,16 +209,15 @@ def check_camera(report: Report, file: Path, camera: Camera) -> None:
 
 
 def _check_distortion(report: Report, file: Path, camera: Camera) -> None:
-    """r (1 + k1 r² + k2 r⁴ + k3 r⁶) must rise with r up to the side of the image."""
-    k = camera.intrinsics
+    """The image radius must rise with the angle of the ray, up to the side of the image."""
+    k, lens = camera.intrinsics, camera.lens
     side = max(k[0, 2], camera.width - k[0, 2]) / k[0, 0]
-    r = np.linspace(0, side, 50)
-    k1, k2, k3 = camera.distortion
-    if (1 + 3 * k1 * r**2 + 5 * k2 * r**4 + 7 * k3 * r**6 <= 0).any():
+    farthest = float(np.hypot(*lens.distort(np.array([lens.reach, 0.0]))))
+    if farthest < side and lens.reach < 50:
         report.warning(
             file,
             f"{camera.name}: the distortion folds the image",
-            "k1, k2, k3 are radial; leave tangential terms out",
+            "are k1 … k6 in the order of rtmap, and is it a pinhole or a fisheye lens?",
         )
 
 
@@ -264,8 +263,10 @@ def _tail(path: Path, count: int = 64) -> bytes:
 
 def check_place(report: Report, file: Path, crs: str, xy: Array) -> None:
     """Whether (n, 2) positions lie where their CRS is meant to be used (with a degree to spare)."""
-    from rtmap_cli.maps.crs import parse_crs, to_lonlat
+    from rtmap_cli.maps.crs import is_local, parse_crs, to_lonlat
 
+    if is_local(crs):
+        return
     area = parse_crs(crs, file).area_of_use
     try:
         lonlat = to_lonlat(crs, xy)

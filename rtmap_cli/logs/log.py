@@ -4,21 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.lens import Lens
+
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with radial distortion k1, k2, k3.
+    """A camera: where it sits, its pixels and its lens.
 
     ``intrinsics`` (3, 3) in pixels of a ``width`` × ``height`` image, pixel centres at integers;
-    the camera frame is x right, y down, z forward; ``ego_SE3_camera`` (4, 4) in metres.
+    the camera frame is x right, y down, z forward; ``ego_SE3_camera`` (4, 4) in metres. ``model``
+    "pinhole" with ``distortion`` k1, k2, k3 or k1 … k6 and ``tangential`` p1, p2, or "fisheye" with
+    k1 … k4 (``rtmap_cli.geometry.lens``); ValueError for anything else.
     """
 
     name: str
@@ -26,7 +31,28 @@ class Camera:
     height: int
     intrinsics: Array
     ego_SE3_camera: Array
-    distortion: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0)
+    model: str = "pinhole"
+    tangential: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        Lens(self.model, self.distortion, self.tangential)
+
+    @cached_property
+    def lens(self) -> Lens:
+        """What bends the rays of this camera."""
+        return Lens(self.model, self.distortion, self.tangential)
+
+    def project(self, points: Array) -> Array:
+        """(..., 3) points of the camera frame → (..., 2) pixels of the image as it is stored;
+        NaN behind the camera and where the lens model means nothing."""
+        depth = points[..., 2]
+        ahead = depth > 1e-6
+        xy = points[..., :2] / np.where(ahead, depth, 1.0)[..., None]
+        seen = ahead & self.lens.inside(xy)
+        bent = self.lens.distort(np.where(seen[..., None], xy, 0.0))
+        pixels = bent @ self.intrinsics[:2, :2].T + self.intrinsics[:2, 2]
+        return np.where(seen[..., None], pixels, np.nan)
 
 
 @dataclass(frozen=True)
@@ -62,7 +88,9 @@ class Frame:
     ``map_SE3_ego`` (4, 4) is the initial pose T⁰ (metre level) in the log's CRS, ``sigma``
     (3,) its standard deviations (x m, y m, yaw rad); ``odometry`` (3,) the motion dx, dy, dyaw
     since the previous frame in the previous frame's ego frame, None where unknown.
-    ``images`` maps camera names to files, ``lidar`` names a sweep or is None.
+    ``images`` maps camera names to files, ``lidar`` names a sweep or is None. Where the vehicle
+    moved between an image and the frame, ``ego_SE3_exposure`` (4, 4) of that camera takes the ego
+    frame at its exposure to the ego frame of this frame; a camera that is not in it exposed now.
     """
 
     index: int
@@ -74,6 +102,7 @@ class Frame:
     images: dict[str, Path] = field(default_factory=dict)
     lidar: Path | None = None
     occluders: tuple[Occluder, ...] = ()
+    ego_SE3_exposure: dict[str, Array] = field(default_factory=dict)
 
 
 class Log(Protocol):

@@ -43,7 +43,7 @@ from rtmap_cli.logs.tables import (
     rig_of_table,
     rig_table,
 )
-from rtmap_cli.maps.crs import check_map_crs
+from rtmap_cli.maps.crs import check_log_crs
 from rtmap_cli.tables import TableSchema, read_json, write_json, write_table
 
 Array = NDArray[np.float64]
@@ -114,7 +114,7 @@ class NativeLog:
         self.path = Path(path)
         self.info = read_log_info(self.path)
         self.log_id = str(self.info["log_id"])
-        self.crs = check_map_crs(str(self.info["crs"]), self.path / "log.json")
+        self.crs = check_log_crs(str(self.info["crs"]), self.path / "log.json")
         self.ground_z = float(self.info["ground_z"])
         self.rig = self._read_rig()
         self._frames_file = self.path / "frames.parquet"

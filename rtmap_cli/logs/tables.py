@@ -26,10 +26,13 @@ SIGMAS = ("sigma_x", "sigma_y", "sigma_yaw")
 DELTAS = ("dx", "dy", "dyaw")
 ODOMETRY = tuple(f"odometry_{n}" for n in DELTAS)
 ODOMETRY_SIGMA = tuple(f"odometry_sigma_{n}" for n in DELTAS)
+RADIAL = tuple(f"k{i}" for i in range(1, 7))
+LATER_LENS = ("k4", "k5", "k6", "p1", "p2")
+"""Lens columns that rigs of version 1.0 lack."""
 
 RIG = TableSchema(
     name="rtmap.log.rig",
-    version="1.0",
+    version="1.1",
     frame="ego_SE3_camera: camera (x right, y down, z forward) to ego (x forward, y left, z up)",
     units="pixels (centres at integers), metres; unit quaternions w, x, y, z",
     description="One row per camera, in the order in which a network sees them.",
@@ -37,7 +40,10 @@ RIG = TableSchema(
         [("camera", pa.string()), ("width", pa.int32()), ("height", pa.int32())]
         + [(n, pa.float64()) for n in ("fx", "fy", "cx", "cy", "k1", "k2", "k3")]
         + [(n, pa.float64()) for n in POSE]
+        + [("model", pa.string())]
+        + [(n, pa.float64()) for n in LATER_LENS]
     ),
+    defaults={"model": "pinhole"} | dict.fromkeys(LATER_LENS, 0.0),
 )
 
 FRAMES = TableSchema(
@@ -119,8 +125,10 @@ def rig_table(rig: Rig) -> pa.Table:
         "cx": k[:, 0, 2],
         "cy": k[:, 1, 2],
     }
-    for i, name in enumerate(("k1", "k2", "k3")):
-        columns[name] = [float(c.distortion[i]) for c in cameras]
+    radial = [(*map(float, c.distortion), *[0.0] * 6)[:6] for c in cameras]
+    columns |= {name: [row[i] for row in radial] for i, name in enumerate(RADIAL)}
+    columns |= {n: [float(c.tangential[i]) for c in cameras] for i, n in enumerate(("p1", "p2"))}
+    columns["model"] = pa.array([c.model for c in cameras], pa.string())
     return pa.table(columns | pose_columns(poses))
 
 
@@ -132,24 +140,38 @@ def rig_of_table(table: pa.Table, path: Path) -> Rig:
         raise BadInput(path, "a camera is listed twice")
     cameras = []
     for row in rows:
-        values = [v for key, v in row.items() if key != "camera"]
+        values = [v for key, v in row.items() if key not in ("camera", "model")]
         if any(not np.isfinite(v) for v in values):
             raise BadInput(path, f"camera {row['camera']} has a value that is not a number")
         q = np.array([row[n] for n in POSE[3:]])
         if abs(np.linalg.norm(q) - 1) > 1e-3:
             raise BadInput(path, f"the quaternion of camera {row['camera']} is not of length 1")
         k = np.array([[row["fx"], 0, row["cx"]], [0, row["fy"], row["cy"]], [0, 0, 1.0]])
-        cameras.append(
-            Camera(
+        try:
+            camera = Camera(
                 name=row["camera"],
                 width=int(row["width"]),
                 height=int(row["height"]),
                 intrinsics=k,
                 ego_SE3_camera=se3_from_quaternion(q, np.array([row[n] for n in POSE[:3]])),
-                distortion=(row["k1"], row["k2"], row["k3"]),
+                distortion=_radial(row),
+                model=row["model"],
+                tangential=(row["p1"], row["p2"]),
             )
-        )
+        except ValueError as error:
+            raise BadInput(path, f"camera {row['camera']}: {error}") from None
+        cameras.append(camera)
     return Rig(tuple(cameras))
+
+
+def _radial(row: dict[str, Any]) -> tuple[float, ...]:
+    """The radial terms of one camera, as many as its model has."""
+    k = tuple(row[n] for n in RADIAL)
+    if row["model"] == "fisheye":
+        if any(k[4:]):
+            raise ValueError("a fisheye lens has k1 to k4: k5 and k6 must be 0")
+        return k[:4]
+    return k if any(k[3:]) else k[:3]
 
 
 def pose_columns(pose: Array) -> dict[str, Any]:

@@ -7,6 +7,7 @@ costs as much as some hundred points.
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -65,6 +66,8 @@ def check_map_crs(crs: str, where: str | Path = "CRS") -> str:
     """``crs`` when it can carry a map frame: projected, metres on both axes; else BadInput."""
     found = parse_crs(crs, where)
     todo = "use a projected CRS in metres, e.g. the UTM zone (EPSG:326xx north, EPSG:327xx south)"
+    if found.is_engineering:
+        raise BadInput(where, f"{found.name} is a local frame without a place on earth", todo)
     if not found.is_projected:
         kind = "geographic (degrees)" if found.is_geographic else "not projected"
         raise BadInput(where, f"{crs} is {kind}, a map frame is not", todo)
@@ -76,6 +79,31 @@ def check_map_crs(crs: str, where: str | Path = "CRS") -> str:
     if operation is not None and "Pseudo Mercator" in operation.method_name:
         raise BadInput(where, f"{crs} (web Mercator) stretches metres with the latitude", todo)
     return crs
+
+
+def local_crs(name: str) -> str:
+    """An engineering CRS (WKT): metres from an origin whose place on earth nobody states.
+
+    Logs and runs may lie in one; a map folder cannot, its tiles have a place on earth.
+    """
+    safe = re.sub(r"[^\w .:+-]", "_", name)
+    return (
+        f'ENGCRS["{safe}",EDATUM["origin of {safe}"],CS[Cartesian,2],'
+        'AXIS["x",unspecified,ORDER[1]],AXIS["y",unspecified,ORDER[2]],LENGTHUNIT["metre",1]]'
+    )
+
+
+def is_local(crs: str) -> bool:
+    """True for an engineering CRS: coordinates without a place on earth."""
+    return bool(parse_crs(crs).is_engineering)
+
+
+def check_log_crs(crs: str, where: str | Path = "CRS") -> str:
+    """``crs`` when it can carry the poses of a log: a map frame, or a local one in metres."""
+    found = parse_crs(crs, where)
+    if found.is_engineering and {a.unit_name for a in found.axis_info[:2]} == {"metre"}:
+        return crs
+    return check_map_crs(crs, where)
 
 
 def same_crs(first: str, second: str) -> bool:
@@ -92,8 +120,9 @@ def _horizontal(crs: CRS) -> CRS:
 def check_same_crs(crs: str, expected: str, where: str | Path) -> None:
     """BadInput naming both when ``crs`` (of the file ``where``) is not ``expected``."""
     if not same_crs(crs, expected):
+        names = [parse_crs(c).name if is_local(c) else c for c in (crs, expected)]
         raise BadInput(
-            where, f"its CRS is {crs}, expected {expected}", f"reproject it to {expected}"
+            where, f"its CRS is {names[0]}, expected {names[1]}", f"reproject it to {names[1]}"
         )
 
 
@@ -107,6 +136,11 @@ def transformer(source: str, target: str) -> Transformer:
     from pyproj import Transformer
     from pyproj.exceptions import ProjError
 
+    for crs in (source, target):
+        if is_local(crs):
+            raise BadInput(
+                parse_crs(crs).name, "is a local frame without a place on earth", "georeference it"
+            )
     try:
         return Transformer.from_crs(
             parse_crs(source),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.cameras import fit_camera, projection
+from rtmap_cli.geometry.poses import invert
 from rtmap_cli.logs.log import Camera
 
 Array = NDArray[np.float64]
@@ -26,30 +27,36 @@ class FittedCamera:
         self, camera: Camera, size: tuple[int, int], horizon: float, ground_z: float
     ) -> None:
         self.camera, self.size = camera, size
-        self.warp, intrinsics = fit_camera(
+        self.warp, self.intrinsics = fit_camera(
             camera.intrinsics,
             camera.ego_SE3_camera,
             (camera.height, camera.width),
             size,
             horizon,
         )
-        road = np.eye(4)
-        road[2, 3] = ground_z
-        matrix = projection(intrinsics, camera.ego_SE3_camera) @ road
-        self.ego_to_image = matrix.astype(np.float32)
-        self._lookup = self._distorted_lookup(intrinsics) if any(camera.distortion) else None
+        self._road = np.eye(4)
+        self._road[2, 3] = ground_z
+        self._matrix = projection(self.intrinsics, camera.ego_SE3_camera)
+        self.ego_to_image = (self._matrix @ self._road).astype(np.float32)
+        self._lookup = None if camera.lens.straight else self._bent_lookup()
 
-    def _distorted_lookup(self, fitted: Array) -> Array:
-        """(H, W, 2) source pixels (x, y) of every fitted pixel under radial distortion."""
+    def at(self, ego_SE3_exposure: Array | None) -> NDArray[np.float32]:
+        """``ego_to_image`` (3, 4) for an image that was exposed while the ego frame stood at
+        ``ego_SE3_exposure`` (4, 4) in the ego frame of the frame; None: at the frame's moment."""
+        if ego_SE3_exposure is None:
+            return self.ego_to_image
+        matrix = self._matrix @ invert(ego_SE3_exposure) @ self._road
+        return np.asarray(matrix, np.float32)
+
+    def _bent_lookup(self) -> Array:
+        """(H, W, 2) source pixels (x, y) of every fitted pixel under the camera's lens; far outside
+        the image where the lens model means nothing."""
         height, width = self.size
         u, v = np.meshgrid(np.arange(width), np.arange(height))
-        rays = np.linalg.solve(fitted, np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3).T)
-        x, y = rays[0] / rays[2], rays[1] / rays[2]
-        r2 = x * x + y * y
-        k1, k2, k3 = self.camera.distortion
-        factor = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        pixels = self.camera.intrinsics @ np.stack([x * factor, y * factor, np.ones_like(x)])
-        return pixels[:2].T.reshape(height, width, 2)
+        fitted = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3)
+        rays: Array = np.linalg.solve(self.intrinsics, fitted.T).T.astype(np.float64)
+        pixels = self.camera.project(rays)
+        return np.where(np.isnan(pixels), -1e6, pixels).reshape(height, width, 2)
 
     def load(self, path: Path) -> NDArray[np.uint8]:
         """Decode one image file and fit it: (H, W, 3) uint8 RGB, black where nothing was seen."""

@@ -143,7 +143,8 @@ def _load(frame: Frame, cameras: dict[str, FittedCamera]) -> _Loaded:
             f"frame {frame.index}", "has no images", "simulate them (rtmap simulate images) or skip"
         )
     images = np.stack([cameras[name].load(frame.images[name]) for name in names])
-    return _Loaded(frame, images, np.stack([cameras[name].ego_to_image for name in names]))
+    matrices = [cameras[name].at(frame.ego_SE3_exposure.get(name)) for name in names]
+    return _Loaded(frame, images, np.stack(matrices))
 
 
 def _load_all(

@@ -1,0 +1,119 @@
+"""Lenses: what bends rays between a camera's axes and its pixels, and its inverse.
+
+Normalised image coordinates are (X / Z, Y / Z) of the camera frame (x right, y down, z forward).
+``pinhole`` is OpenCV's model: radial k1, k2, k3 or the rational k1 … k6, tangential p1, p2;
+``fisheye`` is Kannala and Brandt's of four terms (PAMI 2006), as in OpenCV's fisheye module.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+TERMS = {"pinhole": (3, 6), "fisheye": (4,)}
+"""How many radial terms a model may have."""
+
+_STEEPEST = np.radians(89.0)
+"""Rays farther from the axis have no place on a plane in front of the camera."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """``radial`` k1, k2, k3 or k1 … k6 (pinhole: (1 + k1 r² + k2 r⁴ + k3 r⁶) over
+    (1 + k4 r² + k5 r⁴ + k6 r⁶)) or k1 … k4 (fisheye: θ (1 + k1 θ² + … + k4 θ⁸)); ``tangential``
+    p1, p2 (pinhole only). ValueError for another model or number of terms.
+    """
+
+    model: str = "pinhole"
+    radial: tuple[float, ...] = (0.0, 0.0, 0.0)
+    tangential: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.model not in TERMS:
+            raise ValueError(f"unknown lens model {self.model!r} (known: {', '.join(TERMS)})")
+        if len(self.radial) not in TERMS[self.model]:
+            counts = " or ".join(map(str, TERMS[self.model]))
+            raise ValueError(f"a {self.model} lens has {counts} terms, not {len(self.radial)}")
+        if self.model == "fisheye" and any(self.tangential):
+            raise ValueError("a fisheye lens has no tangential terms")
+
+    @property
+    def straight(self) -> bool:
+        """True when the lens bends nothing: a pure pinhole."""
+        return self.model == "pinhole" and not any(self.radial) and not any(self.tangential)
+
+    def distort(self, xy: Array) -> Array:
+        """(..., 2) straight coordinates → (..., 2) where the lens puts them."""
+        xy = np.asarray(xy, np.float64)
+        r = np.hypot(xy[..., 0], xy[..., 1])
+        factor = np.divide(self._bent(r), r, out=np.ones_like(r), where=r > 1e-9)
+        out = xy * factor[..., None]
+        if any(self.tangential):
+            out = out + self._shifted(xy, r)
+        return out
+
+    def undistort(self, xy: Array) -> Array:
+        """(..., 2) coordinates on the image → (..., 2) straight ones; NaN where the lens puts none.
+
+        The radial part is inverted on its rising branch by bisection, the tangential one by
+        fixed-point steps around it (p1, p2 of real lenses are below 0.01).
+        """
+        xy = np.asarray(xy, np.float64)
+        out = self._straightened(xy)
+        for _ in range(20 if any(self.tangential) else 0):
+            r = np.hypot(out[..., 0], out[..., 1])
+            out = self._straightened(xy - self._shifted(out, r))
+        return out
+
+    @cached_property
+    def reach(self) -> float:
+        """Largest straight radius up to which the image radius rises; beyond it the model folds
+        the picture back and means nothing."""
+        r = np.tan(np.linspace(0.0, _STEEPEST, 4000))
+        bent = self._bent(r)
+        falls = np.flatnonzero(~(np.diff(bent) > 0))
+        return float(r[falls[0]] if len(falls) else r[-1])
+
+    def inside(self, xy: Array) -> NDArray[np.bool_]:
+        """(...,) which straight coordinates (..., 2) the model is meant for (see ``reach``)."""
+        return np.asarray(np.hypot(xy[..., 0], xy[..., 1]) <= self.reach, bool)
+
+    def _bent(self, r: Array) -> Array:
+        """Image radius of straight radii."""
+        k = self.radial
+        if self.model == "fisheye":
+            a = np.arctan(r)
+            s = a * a
+            return a * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))
+        s = r * r
+        out = r * (1 + s * (k[0] + s * (k[1] + s * k[2])))
+        if len(k) == 6:
+            below = 1 + s * (k[3] + s * (k[4] + s * k[5]))
+            # Past a pole of the fraction the model folds: NaN ends the rising branch.
+            out = np.divide(out, below, out=np.full_like(out, np.nan), where=below > 1e-6)
+        return out
+
+    def _shifted(self, xy: Array, r: Array) -> Array:
+        """The tangential part."""
+        (p1, p2), x, y, s = self.tangential, xy[..., 0], xy[..., 1], r * r
+        return np.stack(
+            [2 * p1 * x * y + p2 * (s + 2 * x * x), p1 * (s + 2 * y * y) + 2 * p2 * x * y], axis=-1
+        )
+
+    def _straightened(self, xy: Array) -> Array:
+        """The radial part undone, NaN beyond its reach."""
+        bent = np.hypot(xy[..., 0], xy[..., 1])
+        low, high = np.zeros_like(bent), np.full_like(bent, np.arctan(self.reach))
+        for _ in range(60):
+            middle = (low + high) / 2
+            short = self._bent(np.tan(middle)) < bent
+            low, high = np.where(short, middle, low), np.where(short, high, middle)
+        r = np.tan((low + high) / 2)
+        beyond = ~(bent <= self._bent(np.array(self.reach)))
+        factor = np.divide(r, bent, out=np.ones_like(r), where=bent > 1e-9)
+        return xy * np.where(beyond, np.nan, factor)[..., None]
