@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rtmap_models.bev import cell_centres
-from rtmap_models.config import ModelConfig
+from rtmap_models.config import TinyConfig
 
 
 def conv_block(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
@@ -48,7 +48,7 @@ class PictureNet(nn.Module):
 
     position: Tensor
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: TinyConfig):
         super().__init__()
         c2, c4, c8, c16 = config.widths
         fine, coarse = config.fine_width, config.coarse_width

@@ -1,11 +1,12 @@
-"""The sizes of a network, read from a TOML file."""
+"""The sizes of a network, read from a TOML file. ``architecture`` says which kind it is."""
 
 from __future__ import annotations
 
 import tomllib
-from dataclasses import asdict, dataclass, fields
+import types
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.maps.element import RING_CLASSES
@@ -15,9 +16,10 @@ CONFIGS = Path(__file__).parent / "configs"
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Everything that fixes the shape of a network; see ``configs/rtmap-tiny.toml``."""
+    """What every network has: the classes, the range, the queries, the images, the targets."""
 
     name: str
+    architecture: str
     classes: tuple[str, ...]
     range_m: tuple[float, float, float, float]
     vertex_count: int
@@ -27,13 +29,6 @@ class ModelConfig:
     horizon: float
     cell_m: float
     supersample: int
-    widths: tuple[int, int, int, int]
-    fine_width: int
-    coarse_width: int
-    query_width: int
-    point_width: int
-    heads: int
-    layers: int
 
     @property
     def half_range(self) -> tuple[float, float]:
@@ -42,7 +37,7 @@ class ModelConfig:
 
     @property
     def picture_size(self) -> tuple[int, int]:
-        """Rows (y) and columns (x) of the bird's-eye picture."""
+        """Rows (y) and columns (x) of the bird's-eye picture; targets are half as large."""
         half_x, half_y = self.half_range
         return round(2 * half_y / self.cell_m), round(2 * half_x / self.cell_m)
 
@@ -51,25 +46,154 @@ class ModelConfig:
         """Indices of the classes whose elements are closed rings."""
         return tuple(k for k, name in enumerate(self.classes) if name in RING_CLASSES)
 
+    @property
+    def needs_images(self) -> bool:
+        """Whether training needs the cameras' images (else bird's-eye pictures are enough)."""
+        return False
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as stored in checkpoints."""
         return asdict(self)
 
+    def check(self) -> str | None:
+        """What is wrong with the values, if anything."""
+        x0, y0, x1, y1 = self.range_m
+        if x0 != -x1 or y0 != -y1 or x1 <= 0 or y1 <= 0:
+            return "range_m must be centred on the vehicle: [-x, -y, x, y]"
+        for name in ("vertex_count", "new_queries", "prior_slots", "supersample"):
+            if getattr(self, name) < 1:
+                return f"{name} must be at least 1"
+        if self.vertex_count < 4 or not self.classes or min(self.image_size) < 1:
+            return "it needs a class, 4 vertices per element and an image size"
+        return None
+
+
+@dataclass(frozen=True)
+class TinyConfig(ModelConfig):
+    """The picture network; see ``configs/rtmap-tiny.toml``."""
+
+    widths: tuple[int, int, int, int]
+    fine_width: int
+    coarse_width: int
+    query_width: int
+    point_width: int
+    heads: int
+    layers: int
+
+    def check(self) -> str | None:
+        """What is wrong with the values, if anything."""
+        if any(size % 16 for size in self.picture_size):
+            return "the picture must have multiples of 16 cells: change cell_m"
+        return super().check()
+
+
+@dataclass(frozen=True)
+class PaperConfig(ModelConfig):
+    """The network of the RTMap paper; see ``configs/rtmap-r50.toml``.
+
+    The bird's-eye map has cells of 2 · ``cell_m``: the grid of the segmentation targets.
+    """
+
+    encoder: str  # "camera" or "raster"
+    raster_channels: int  # of the raster encoder's input
+    backbone: str  # "resnet18" or "resnet50"
+    backbone_norm: str  # "batch" (from scratch) or "frozen" (with weights that the user brings)
+    image_width: int  # channels of the image features that are lifted
+    heights_m: tuple[float, ...]  # where a bird's-eye cell looks into the images
+    bev_blocks: int
+    width: int  # channels of the bird's-eye map, of queries and of points
+    heads: int
+    deform_points: int
+    feedforward: int
+    layers: int
+    dropout: float
+    pose: str  # "least_squares" or "learned": which pose the graph answers with
+    pre_attribution: bool
+    use_nll: bool
+    use_pose_loss: bool
+    many_queries: int  # one-to-many queries, in training only; 0 = none
+    many_repeat: int
+    class_weight: float
+    manhattan_weight: float
+    nll_weight: float
+    direction_weight: float
+    pose_weight: float
+    translation_weight: float
+    bev_segmentation_weight: float
+    image_segmentation_weight: float
+    many_weight: float
+
+    @property
+    def needs_images(self) -> bool:
+        """The camera encoder reads images; a raster comes as the batch's picture."""
+        return self.encoder == "camera"
+
+    @property
+    def bev_size(self) -> tuple[int, int]:
+        """Rows (y) and columns (x) of the bird's-eye map."""
+        rows, columns = self.picture_size
+        return rows // 2, columns // 2
+
+    def check(self) -> str | None:
+        """What is wrong with the values, if anything."""
+        choices = {
+            "encoder": ("camera", "raster"),
+            "backbone": ("resnet18", "resnet50"),
+            "backbone_norm": ("batch", "frozen"),
+            "pose": ("least_squares", "learned"),
+        }
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                return f"{name} must be one of {', '.join(allowed)}"
+        for name in ("raster_channels", "image_width", "width", "heads", "layers", "feedforward"):
+            if getattr(self, name) < 1:
+                return f"{name} must be at least 1"
+        if self.width % self.heads or not self.heights_m or self.deform_points < 1:
+            return "width must be a multiple of heads; a height and a deform point are needed"
+        if any(size % 4 for size in self.picture_size):
+            return "the picture must have multiples of 4 cells: change cell_m"
+        return super().check()
+
+
+KINDS: dict[str, type[ModelConfig]] = {"tiny": TinyConfig, "paper": PaperConfig}
+
 
 def config_from_dict(values: dict[str, Any], where: str | Path = "configuration") -> ModelConfig:
-    """A configuration from plain values; BadInput when a key is missing or unknown."""
-    known = {f.name for f in fields(ModelConfig)}
-    if set(values) != known:
-        odd = sorted(set(values) ^ known)
-        raise BadInput(where, f"missing or unknown keys: {', '.join(odd)}", "see rtmap-tiny.toml")
+    """A configuration from plain values; BadInput when a key is missing, unknown or of a wrong
+    type. Without ``architecture`` it is "tiny" (checkpoints of earlier versions)."""
+    values = {"architecture": "tiny"} | values
+    kind = KINDS.get(str(values["architecture"]))
+    if kind is None:
+        raise BadInput(where, "unknown architecture", f"use one of {', '.join(KINDS)}")
+    known = {f.name: f for f in fields(kind)}
+    needed = {k for k, f in known.items() if f.default is MISSING}
+    if odd := sorted((set(values) - set(known)) | (needed - set(values))):
+        like = "rtmap-tiny.toml" if kind is TinyConfig else "rtmap-r50.toml"
+        raise BadInput(where, f"missing or unknown keys: {', '.join(odd)}", f"see {like}")
     plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    config = ModelConfig(**plain)
-    x0, y0, x1, y1 = config.range_m
-    if x0 != -x1 or y0 != -y1 or x1 <= 0 or y1 <= 0:
-        raise BadInput(where, "range_m must be centred on the vehicle", "give [-x, -y, x, y]")
-    if any(size % 16 for size in config.picture_size):
-        raise BadInput(where, "the picture must have multiples of 16 cells", "change cell_m")
+    hints = get_type_hints(kind)
+    if wrong := [k for k, v in plain.items() if not _fits(v, hints[k])]:
+        raise BadInput(where, f"{wrong[0]} has a value of a wrong type", f"it is {hints[wrong[0]]}")
+    config = kind(**plain)
+    if problem := config.check():
+        raise BadInput(where, problem, "change the configuration")
     return config
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a plain value is of an annotated type (plain types, unions and tuples of them)."""
+    if get_origin(hint) is tuple:
+        if not isinstance(value, tuple):
+            return False
+        parts = get_args(hint)
+        if parts[-1] is Ellipsis:
+            return all(_fits(v, parts[0]) for v in value)
+        return len(value) == len(parts) and all(map(_fits, value, parts))
+    if isinstance(hint, types.UnionType):
+        return any(_fits(value, h) for h in get_args(hint))
+    if isinstance(value, bool) or hint is bool:
+        return isinstance(value, bool) and hint is bool
+    return isinstance(value, (int, float) if hint is float else hint)
 
 
 def load_config(name: str | Path = "rtmap-tiny") -> ModelConfig:
@@ -82,6 +206,6 @@ def load_config(name: str | Path = "rtmap-tiny") -> ModelConfig:
         raise BadInput(path, "no such configuration", f"use one of {have} or a .toml file")
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise BadInput(path, f"not TOML: {error}", "mend the file") from error
     return config_from_dict(values, path)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rtmap_models.config import ModelConfig
+from rtmap_models.config import TinyConfig
 from rtmap_models.queries import Queries
 
 NORMAL_OFFSET_M = 0.8
@@ -68,7 +68,7 @@ class RefineLayer(nn.Module):
 
     frequencies: Tensor
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: TinyConfig):
         super().__init__()
         self.heads, width, point = config.heads, config.query_width, config.point_width
         vertices = config.vertex_count
@@ -158,7 +158,7 @@ class RefineLayer(nn.Module):
 class Decoder(nn.Module):
     """A stack of refinement layers; each starts from the detached points of the one before."""
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: TinyConfig):
         super().__init__()
         self.layers = nn.ModuleList(RefineLayer(config) for _ in range(config.layers))
 

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from rtmap_models.backbone import PictureNet
 from rtmap_models.bev import BevWarp, normalize_picture
-from rtmap_models.config import ModelConfig
+from rtmap_models.config import TinyConfig
 from rtmap_models.decoder import Decoder, LayerOutput, attention_bias
 from rtmap_models.pose import PoseEstimate, PoseHead
 from rtmap_models.queries import DenseProposals, PriorEncoder, ProposalHead, Queries, join
@@ -47,7 +47,7 @@ class RTMapNet(nn.Module):
     sigma_factor: Tensor
     score_line: Tensor
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: TinyConfig):
         super().__init__()
         self.config = config
         self.warp = BevWarp(*config.half_range, *config.picture_size, config.supersample)

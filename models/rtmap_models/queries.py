@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from rtmap_models.backbone import conv_block
 from rtmap_models.bev import cell_centres
-from rtmap_models.config import ModelConfig
+from rtmap_models.config import TinyConfig
 
 OFFSET_SCALE = 8.0
 """Metres per unit of the proposal head, so that its weights stay near one."""
@@ -36,7 +36,7 @@ class ProposalHead(nn.Module):
 
     centres: Tensor
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: TinyConfig):
         super().__init__()
         self.count, self.vertices = config.new_queries, config.vertex_count
         self.classes = len(config.classes)
@@ -82,7 +82,7 @@ class ProposalHead(nn.Module):
         return queries, DenseProposals(heat, dense + self.centres[:, :, None])
 
 
-def _first_shapes(config: ModelConfig) -> Tensor:
+def _first_shapes(config: TinyConfig) -> Tensor:
     """(C, V, 2) metres: rings start as an ellipse, lines as 20 m along x."""
     v = config.vertex_count
     angle = torch.arange(v) / (v - 1) * 2 * math.pi
@@ -94,7 +94,7 @@ def _first_shapes(config: ModelConfig) -> Tensor:
 class PriorEncoder(nn.Module):
     """Elements of the prior map as queries; their geometry enters through the reference points."""
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: TinyConfig):
         super().__init__()
         self.classes = len(config.classes)
         self.embed = nn.Linear(self.classes, config.query_width)

@@ -1,0 +1,24 @@
+"""The network that a configuration describes: one interface, two architectures.
+
+Every network has ``config``; ``forward`` (the exported graph, docs/model-contract.md);
+``predict_batch(batch, bf16=False)`` → the output of every layer; ``losses(batch, bf16)`` → the
+weighted parts by name, whose sum is the loss.
+"""
+
+from __future__ import annotations
+
+from torch import nn
+
+from rtmap_models.config import ModelConfig, PaperConfig, TinyConfig
+
+
+def build_network(config: ModelConfig) -> nn.Module:
+    """A network with fresh weights, chosen by ``config.architecture``."""
+    if isinstance(config, PaperConfig):
+        from rtmap_models.paper.network import build_paper_network
+
+        return build_paper_network(config)
+    from rtmap_models.network import RTMapNet
+
+    assert isinstance(config, TinyConfig)
+    return RTMapNet(config)
