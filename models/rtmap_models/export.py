@@ -4,84 +4,84 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import warnings
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 import torch
-from torch import Tensor
+from onnx import TensorProto
+from torch import nn
 
-from rtmap_cli.errors import NoAnswer
+from rtmap_cli.errors import Findings
 from rtmap_cli.tables import whole_file
-from rtmap_models.config import ModelConfig
-from rtmap_models.network import RTMapNet
+from rtmap_models.example import example_inputs
+from rtmap_models.half import to_half
+from rtmap_models.onnx_weights import CONFIG_KEY, keep_weights, read_configuration, read_weights
+from rtmap_models.parity import (
+    HALF,
+    INPUTS,
+    OUTPUTS,
+    SINGLE,
+    ParityReport,
+    parity,
+    parity_report,
+)
+
+__all__ = [
+    "INPUTS",
+    "OPSET",
+    "OUTPUTS",
+    "ParityMiss",
+    "code_version",
+    "example_inputs",
+    "export_onnx",
+    "parity",
+    "read_configuration",
+    "read_weights",
+]
 
 OPSET = 20
-INPUTS = ("images", "ego_to_image", "prior_points", "prior_class", "prior_mask")
-OUTPUTS = ("scores", "points", "sigma", "prior_score", "pose_delta", "pose_covariance")
-
-PARITY_M = 2e-3
-"""Largest difference between torch and onnxruntime that an export may have: metres, radians, or
-relative where a value exceeds 1."""
 
 
-def example_inputs(
-    config: ModelConfig, batch: int, cameras: int, priors: int, seed: int = 0
-) -> tuple[Tensor, ...]:
-    """Plausible inputs of any size: noise images, cameras all round, straight prior lines."""
-    rng = np.random.default_rng(seed)
-    height, width = config.image_size
-    images = rng.integers(0, 256, (batch, cameras, height, width, 3), dtype=np.uint8)
-    projections = np.zeros((batch, cameras, 3, 4), np.float32)
-    for k in range(cameras):
-        projections[:, k] = _looking(2 * np.pi * k / cameras, config)
-    start = rng.uniform(-15, 15, (batch, priors, 1, 2))
-    step = rng.normal(0, 1, (batch, priors, 1, 2))
-    along = np.linspace(-1, 1, config.vertex_count)[:, None]
-    points = (start + step * 5 * along).astype(np.float32)
-    class_id = rng.integers(0, len(config.classes), (batch, priors))
-    mask = (rng.random((batch, priors)) < 0.8).astype(np.float32)
-    arrays = (images, projections, points, class_id, mask)
-    return tuple(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays)
+class ParityMiss(Findings):
+    """The graph and torch differ by more than the tolerance; ``report`` says where."""
+
+    def __init__(self, path: Path, report: ParityReport) -> None:
+        self.report = report
+        super().__init__(f"{path}: {report.miss()}; not written")
 
 
-def _looking(yaw: float, config: ModelConfig) -> np.ndarray:
-    """(3, 4) projection of a level camera 1.5 m above the road that looks towards ``yaw``."""
-    height, width = config.image_size
-    forward = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
-    rows = np.stack([right, [0.0, 0.0, -1.0], forward])
-    focal = 0.6 * width
-    k = np.array([[focal, 0, width / 2], [0, focal, config.horizon * height], [0, 0, 1]])
-    centre = np.array([0.0, 0.0, 1.5])
-    return k @ np.column_stack([rows, -rows @ centre])
+def export_onnx(
+    network: nn.Module, path: Path, metadata: dict[str, Any], half: bool = False
+) -> ParityReport:
+    """Write the ONNX file of a network (docs/model-contract.md) and prove it against torch.
 
-
-def export_onnx(network: RTMapNet, path: Path, metadata: dict[str, Any]) -> dict[str, float]:
-    """Write the ONNX file and prove it against torch at two other sizes.
-
-    ``metadata`` adds to what the configuration says (training data, licence, …). Returns the
-    largest differences per output; NoAnswer when one exceeds `PARITY_M`.
+    ``network`` holds its configuration in ``.config``. ``metadata`` adds to what the configuration
+    says (training data, licence, …). With ``half`` the file is a variant for GPUs, see
+    `rtmap_models.half`. Otherwise `read_weights` gives the network's state dict back from the
+    file. ParityMiss when the graph and torch differ by more than the tolerance: nothing is written
+    then.
     """
     network = network.eval()
+    model = _trace(network)
+    _clean(model)
+    if half:
+        to_half(model)
+    else:
+        keep_weights(model, network.state_dict())
+    _describe(model, network, metadata)
     with whole_file(path) as temporary:
-        _trace(network, temporary)
-        model = onnx.load(temporary)
-        _clean(model)
-        _describe(model, network.config, metadata)
         onnx.checker.check_model(model, full_check=True)
         onnx.save(model, temporary)
-        differences = parity(network, temporary)
-        worst = max(differences.values())
-        if not worst <= PARITY_M:
-            name = max(differences, key=lambda k: differences[k])
-            raise NoAnswer(f"{name} of the graph differs from torch by {worst:.2g}: not written")
-    return differences
+        report = parity_report(network, temporary, HALF if half else SINGLE)
+        if not report.within:
+            raise ParityMiss(path, report)
+    return report
 
 
-def _trace(network: RTMapNet, path: Path) -> None:
+def _trace(network: nn.Module) -> onnx.ModelProto:
     # Traced at sizes above one: a graph traced at 1 claims to be dynamic and fails at 3.
     inputs = example_inputs(network.config, batch=2, cameras=3, priors=4)
     batch, cameras, priors = (torch.export.Dim(name, min=1) for name in ("B", "N", "P"))
@@ -92,12 +92,12 @@ def _trace(network: RTMapNet, path: Path) -> None:
         "prior_class": {0: batch, 1: priors},
         "prior_mask": {0: batch, 1: priors},
     }
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, we do not
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        torch.onnx.export(
+        program = torch.onnx.export(
             network,
             inputs,
-            str(path),
             dynamo=True,
             opset_version=OPSET,
             input_names=list(INPUTS),
@@ -105,7 +105,37 @@ def _trace(network: RTMapNet, path: Path) -> None:
             dynamic_shapes=shapes,
             external_data=False,
             verbose=False,
+            optimize=False,
         )
+    assert program is not None
+    return _fold(program.model)
+
+
+def _fold(model: Any) -> onnx.ModelProto:
+    """Fold constants and drop what is computed twice.
+
+    The exporter's own optimisation does this too, but merges batch normalisation into the
+    convolutions before it: the weights could not be read back. onnxruntime merges them when it
+    loads the file, and is as fast.
+    """
+    import onnx_ir
+    import onnx_ir.passes.common as passes
+    from onnxscript import optimizer
+
+    optimizer.inline(model)
+    for _ in range(2):
+        optimizer.fold_constants_ir(model)
+        optimizer.remove_unused_nodes(model)
+    for step in (
+        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
+        passes.LiftSubgraphInitializersToMainGraphPass(),
+        passes.DeduplicateInitializersPass(),
+        passes.CommonSubexpressionEliminationPass(),
+        passes.OutputFixPass(),
+        passes.NameFixPass(),
+    ):
+        step(model)
+    return onnx_ir.to_proto(model)
 
 
 def _clean(model: onnx.ModelProto) -> None:
@@ -115,23 +145,26 @@ def _clean(model: onnx.ModelProto) -> None:
     graphs: list[Any] = [model.graph, *model.functions]
     for graph in graphs:
         graph.doc_string = ""
+        del graph.metadata_props[:]
         for node in graph.node:
             node.doc_string = ""
             del node.metadata_props[:]
-        for value in [*graph.value_info] if hasattr(graph, "value_info") else []:
+        for value in graph.value_info:
             del value.metadata_props[:]
     for value in [*model.graph.input, *model.graph.output, *model.graph.initializer]:
         value.doc_string = ""
         del value.metadata_props[:]
-    del model.graph.metadata_props[:]
 
 
-def _describe(model: onnx.ModelProto, config: ModelConfig, extra: dict[str, Any]) -> None:
+def _describe(model: onnx.ModelProto, network: nn.Module, extra: dict[str, Any]) -> None:
     """The metadata of docs/model-contract.md; structured values as JSON text."""
-    model.producer_name = "rtmap"
+    config = network.config
+    model.producer_name, model.producer_version = "rtmap", ""
+    half = any(i.data_type == TensorProto.FLOAT16 for i in model.graph.initializer)
     values: dict[str, Any] = {
         "model_name": config.name,
         "model_version": "1",
+        "architecture": getattr(config, "architecture", "tiny"),
         "classes": list(config.classes),
         "range_m": {
             "x": [config.range_m[0], config.range_m[2]],
@@ -145,35 +178,21 @@ def _describe(model: onnx.ModelProto, config: ModelConfig, extra: dict[str, Any]
         "prior_slots": config.prior_slots,
         "image_size": list(config.image_size),
         "horizon": config.horizon,
+        "camera_count": "dynamic",
         "sigma": "standard deviation, metres",
+        "opset": OPSET,
+        "precision": "float16" if half else "float32",
+        "parameters": sum(p.numel() for p in network.parameters()),
     } | extra
     for key, value in values.items():
-        entry = model.metadata_props.add()
-        entry.key = f"rtmap.{key}"
-        entry.value = value if isinstance(value, str) else json.dumps(value)
+        _note(model, f"rtmap.{key}", value)
+    _note(model, CONFIG_KEY, config.to_dict())
 
 
-def parity(
-    network: RTMapNet, path: Path, sizes: tuple[tuple[int, int, int], ...] = ((1, 7, 9), (3, 5, 1))
-) -> dict[str, float]:
-    """Largest difference torch against onnxruntime per output, at (B, N, P) sizes.
-
-    Absolute up to 1 and relative above it (a variance may be large).
-    """
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    worst = dict.fromkeys(OUTPUTS, 0.0)
-    for seed, (batch, cameras, priors) in enumerate(sizes):
-        inputs = example_inputs(network.config, batch, cameras, priors, seed + 1)
-        with torch.no_grad():
-            expected = network(*inputs)
-        feed = {name: x.numpy() for name, x in zip(INPUTS, inputs, strict=True)}
-        got = session.run(list(OUTPUTS), feed)
-        for name, a, b in zip(OUTPUTS, expected, got, strict=True):
-            difference = np.abs(a.numpy() - b) / np.maximum(1.0, np.abs(b))
-            worst[name] = max(worst[name], float(difference.max()))
-    return worst
+def _note(model: onnx.ModelProto, key: str, value: Any) -> None:
+    entry = model.metadata_props.add()
+    entry.key = key
+    entry.value = value if isinstance(value, str) else json.dumps(value)
 
 
 def code_version() -> str:

@@ -30,6 +30,10 @@ NEEDS = "the export needs the extra 'train': pip install 'rtmap[train]'"
     help="Frames that training did not see (made by rtmap train --frames --data): sigmas and the "
     "pose covariance are scaled to be honest on them.",
 )
+@click.option(
+    "--fp16", is_flag=True, help="Half-precision weights, for GPUs; places stay single precision."
+)
+@click.option("--report", type=options.PATH, help="Also write the comparison with torch (JSON).")
 @options.as_json
 @options.overwrite
 def command(
@@ -39,52 +43,86 @@ def command(
     training_data: str,
     licence: str,
     calibrate: Path | None,
+    fp16: bool,
+    report: Path | None,
     as_json: bool,
     overwrite: bool,
 ) -> None:
     """Export WEIGHTS of `rtmap train` to one ONNX file and check it against torch.
 
     Standard operators only; batch, cameras and prior slots are dynamic; the metadata says the
-    rest. An export that differs from torch is not written (exit 4).
+    rest. The file is compared with torch on every execution provider of onnxruntime at two sizes;
+    one that differs is not written (exit 1).
 
     \b
     Example:
       rtmap export-model weights.pt -o model.onnx
     """
-    if output.exists() and not overwrite:
-        raise UsageError(f"{output} exists; pass --overwrite")
+    for path in (output, report):
+        if path is not None and path.exists() and not overwrite:
+            raise UsageError(f"{path} exists; pass --overwrite")
+    if report is not None and report.resolve() == output.resolve():
+        raise UsageError("--report and --output are the same file")
     try:
         from rtmap_models.checkpoint import load_network
-        from rtmap_models.export import code_version, export_onnx
+        from rtmap_models.export import ParityMiss, export_onnx
     except ModuleNotFoundError as error:
         raise UsageError(f"{NEEDS} ({error.name} is missing)") from None
-    from rtmap_cli.output import emit
+    import json
+
+    from rtmap_cli.output import emit, plain
+    from rtmap_cli.tables import whole_file
 
     network, content = load_network(weights)
+    factors = _calibrated(network, calibrate)
+    metadata = _metadata(content, name, training_data, licence, factors)
+    result: dict[str, Any] = {"model": str(output), "calibration": factors}
+    try:
+        parity = export_onnx(network, output, metadata, half=fp16)
+    except ParityMiss as miss:
+        emit(
+            result | {"model": None, "parity": miss.report.as_json()}, as_json, miss.report.lines()
+        )
+        raise
+    megabytes = output.stat().st_size / 1e6
+    result |= {"megabytes": megabytes, "differences": parity.worst(), "parity": parity.as_json()}
+    if report is not None:
+        with whole_file(report) as temporary:
+            temporary.write_text(json.dumps(plain(result), indent=1) + "\n", encoding="utf-8")
+    emit(result, as_json, [*parity.lines(), f"{output}: {megabytes:.1f} MB"])
+
+
+def _metadata(
+    content: dict[str, Any],
+    name: str | None,
+    training_data: str,
+    licence: str,
+    factors: dict[str, Any],
+) -> dict[str, Any]:
+    """What the checkpoint and the caller say about the model."""
+    from rtmap_models.export import code_version
+
     amount = f"{content['frames']} frames, {content['samples']} samples"
     metadata: dict[str, Any] = {
         "training_data": f"{training_data}: {amount}",
+        "training": {k: content[k] for k in ("step", "samples", "frames", "seconds")},
         "licence": licence,
         "code_sha": code_version(),
     }
     if name:
         metadata["model_name"] = name
-    factors: dict[str, Any] = {}
-    if calibrate is not None:
-        from rtmap_models.calibrate import calibrate as scale
-        from rtmap_models.dataset import Frames
-        from rtmap_models.scores import calibrate_scores
-
-        held_out = Frames(calibrate, network.config)
-        factors = {**scale(network, held_out), **calibrate_scores(network, held_out)}
+    if factors:
         metadata["calibration"] = factors
-    differences = export_onnx(network, output, metadata)
-    megabytes = output.stat().st_size / 1e6
-    result = {
-        "model": str(output),
-        "megabytes": megabytes,
-        "differences": differences,
-        "calibration": factors,
-    }
-    worst = max(differences.values())
-    emit(result, as_json, [f"{output}: {megabytes:.1f} MB, differs from torch by {worst:.1g}"])
+    return metadata
+
+
+def _calibrated(network: Any, frames: Path | None) -> dict[str, Any]:
+    """Scale the network's uncertainties and scores on held-out frames; the factors by name."""
+    if frames is None:
+        return {}
+    from rtmap_models.calibrate import calibrate
+    from rtmap_models.dataset import Frames
+    from rtmap_models.scores import calibrate_scores
+
+    held_out = Frames(frames, network.config)
+    return {**calibrate(network, held_out), **calibrate_scores(network, held_out)}

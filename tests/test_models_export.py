@@ -1,0 +1,194 @@
+"""``rtmap export-model``: parity, half precision, metadata, and weights that come back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="torch is not installed (extra: train)")
+pytest.importorskip("onnxscript", reason="onnxscript is not installed (extra: train)")
+
+import onnx  # noqa: E402
+import onnxruntime  # noqa: E402
+from rtmap_models.checkpoint import load_network, save_checkpoint  # noqa: E402
+from rtmap_models.config import CONFIGS, load_config  # noqa: E402
+from rtmap_models.export import read_configuration, read_weights  # noqa: E402
+from rtmap_models.network import RTMapNet  # noqa: E402
+
+from rtmap_cli.errors import BadInput  # noqa: E402
+from rtmap_cli.steps.infer import find_model  # noqa: E402
+
+SMALL = {
+    "cell_m = 0.25": "cell_m = 0.75",
+    "supersample = 2": "supersample = 1",
+    "[24, 48, 96, 128]": "[8, 8, 16, 16]",
+    "fine_width = 24": "fine_width = 8",
+    "coarse_width = 64": "coarse_width = 16",
+    "query_width = 128": "query_width = 32",
+    "point_width = 48": "point_width = 16",
+    "layers = 3": "layers = 1",
+    "new_queries = 50": "new_queries = 12",
+    "[128, 224]": "[32, 48]",
+    'name = "rtmap-tiny"': 'name = "rtmap-test"',
+}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint of a small network with every parameter and statistic away from its start."""
+    folder = tmp_path_factory.mktemp("weights")
+    text = (CONFIGS / "rtmap-tiny.toml").read_text()
+    for old, new in SMALL.items():
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "small.toml").write_text(text)
+    config = load_config(folder / "small.toml")
+    torch.manual_seed(0)
+    network = RTMapNet(config)
+    with torch.no_grad():
+        for name, tensor in network.state_dict().items():
+            if name.endswith("num_batches_tracked"):
+                tensor.fill_(7)
+            elif name.endswith("running_var"):
+                tensor.uniform_(0.5, 2.0)
+            else:
+                tensor.add_(torch.randn(tensor.shape) * 0.05)
+    state = network.state_dict()
+    numbers = {"step": 60, "seconds": 1.5, "samples": 480, "frames": 12}
+    save_checkpoint(folder / "w.pt", config, {"average": state, "network": state, **numbers})
+    return folder / "w.pt"
+
+
+@pytest.fixture(scope="module")
+def exported(weights: Path) -> dict[str, Any]:
+    """The model and its report, from the command line."""
+    return _export(weights, "model.onnx")
+
+
+def _export(weights: Path, name: str, *more: str) -> dict[str, Any]:
+    from rtmap_cli.cli import run
+
+    path, report = weights.with_name(name), weights.with_name(f"{name}.json")
+    call = ["export-model", str(weights), "-o", str(path), "--report", str(report), *more]
+    assert run(call) == 0
+    return {"path": path, "report": json.loads(report.read_text())}
+
+
+def test_the_report_names_providers_and_sizes(exported: dict[str, Any]) -> None:
+    parity = exported["report"]["parity"]
+    assert parity["within"] is True
+    sizes = {(r["batch"], r["cameras"], r["prior_slots"]) for r in parity["rows"]}
+    assert len(sizes) == 2 and min(map(min, sizes)) == 1
+    assert {"CPUExecutionProvider"} <= {r["provider"] for r in parity["rows"]}
+    for row in parity["rows"]:
+        assert 0 < max(row["differences"].values()) < 1e-3
+
+
+def test_weights_come_back_bit_for_bit(exported: dict[str, Any], weights: Path) -> None:
+    network, content = load_network(weights)
+    state = read_weights(exported["path"])
+    assert state is not None and state.keys() == content["average"].keys()
+    for name, tensor in content["average"].items():
+        assert state[name].dtype == tensor.dtype and torch.equal(state[name], tensor), name
+    network.load_state_dict(state)
+    assert read_configuration(exported["path"]) == json.loads(json.dumps(network.config.to_dict()))
+    # Small additions only: the graph's own initializers hold nearly all of it.
+    extra = onnx.load(exported["path"]).training_info[0].algorithm.initializer
+    assert sum(len(i.raw_data) for i in extra) < 0.2 * exported["path"].stat().st_size
+
+
+def test_changed_or_foreign_models_give_no_weights(
+    exported: dict[str, Any], tmp_path: Path
+) -> None:
+    model = onnx.load(exported["path"])
+    tensor = next(i for i in model.graph.initializer if i.name == "propose.heat.weight")
+    tensor.raw_data = bytes(len(tensor.raw_data))
+    onnx.save(model, tmp_path / "changed.onnx")
+    assert read_weights(tmp_path / "changed.onnx") is None
+    del model.training_info[:]
+    onnx.save(model, tmp_path / "stripped.onnx")
+    assert read_weights(tmp_path / "stripped.onnx") is None
+    (tmp_path / "cut.onnx").write_bytes(exported["path"].read_bytes()[:5000])
+    for name in ("cut.onnx", "none.onnx"):
+        with pytest.raises(BadInput, match=name):
+            read_weights(tmp_path / name)
+
+
+def test_the_shipped_model_reads(tmp_path: Path) -> None:
+    path = find_model("rtmap-tiny")
+    state = read_weights(path)
+    assert state is None or read_configuration(path) is not None
+
+
+def test_metadata(exported: dict[str, Any]) -> None:
+    session = onnxruntime.InferenceSession(str(exported["path"]))
+    meta = session.get_modelmeta().custom_metadata_map
+    assert meta["rtmap.opset"] == "20" and meta["rtmap.precision"] == "float32"
+    assert json.loads(meta["rtmap.training"])["samples"] == 480
+    assert "480 samples" in meta["rtmap.training_data"]
+    state = read_weights(exported["path"])
+    assert state is not None
+    statistics = ("running_mean", "running_var", "num_batches_tracked", "inflation", "sigma_factor")
+    own = sum(t.numel() for n, t in state.items() if not n.endswith(statistics))
+    assert int(meta["rtmap.parameters"]) == own
+    raw = exported["path"].read_bytes()
+    assert str(Path(__file__).parents[1]).encode() not in raw and b"site-packages" not in raw
+    model = onnx.load(exported["path"])
+    assert {node.domain for node in model.graph.node} == {""} and not model.functions
+
+
+def test_half_precision(weights: Path, exported: dict[str, Any], tmp_path: Path) -> None:
+    half = _export(weights, "half.onnx", "--fp16")
+    assert half["report"]["parity"]["within"] is True
+    assert half["path"].stat().st_size < 0.8 * exported["path"].stat().st_size
+    session, single = (onnxruntime.InferenceSession(str(x["path"])) for x in (half, exported))
+    for a, b in (
+        (session.get_inputs(), single.get_inputs()),
+        (session.get_outputs(), single.get_outputs()),
+    ):
+        assert [(x.name, x.type, x.shape) for x in a] == [(x.name, x.type, x.shape) for x in b]
+    assert session.get_modelmeta().custom_metadata_map["rtmap.precision"] == "float16"
+    graph = onnx.load(half["path"]).graph
+    kinds = {i.name: i.data_type for i in graph.initializer}
+    convolutions = [n for n in graph.node if n.op_type == "Conv"]
+    inside = [n for n in convolutions if kinds[n.input[1]] == onnx.TensorProto.FLOAT16]
+    assert len(inside) > 0.8 * len(convolutions)
+    assert read_weights(half["path"]) is None
+
+
+def test_places_stay_single_precision(weights: Path, exported: dict[str, Any]) -> None:
+    """What feeds a grid, a pose or an output is computed in float32 in the half variant."""
+    from rtmap_models.half import to_half
+
+    model = onnx.load(exported["path"])
+    to_half(model)
+    inferred = onnx.shape_inference.infer_shapes(model).graph
+    kinds = {v.name: v.type.tensor_type.elem_type for v in [*inferred.value_info, *inferred.input]}
+    grids = [n.input[1] for n in inferred.node if n.op_type == "GridSample"]
+    assert grids and {kinds[g] for g in grids} == {onnx.TensorProto.FLOAT}
+    ran = {n.op_type for n in inferred.node if kinds.get(n.output[0]) == onnx.TensorProto.FLOAT16}
+    assert not ran & {"GridSample", "TopK", "Div", "Sqrt", "Reciprocal", "Exp", "ScatterND"}
+    weights32 = {i.name for i in model.graph.initializer if i.data_type == onnx.TensorProto.FLOAT}
+    assert "propose.shape.weight" in weights32 and "decoder.layers.0.move.weight.T" in weights32
+
+
+def test_a_miss_writes_nothing_and_exits_1(
+    rtmap: Callable[..., Any], weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """onnxruntime is made to answer a little beside: as a faulty provider would."""
+    run = onnxruntime.InferenceSession.run
+
+    def off(self: Any, names: Any, feed: Any, *more: Any) -> Any:
+        return [x + np.float32(0.01) for x in run(self, names, feed, *more)]
+
+    monkeypatch.setattr(onnxruntime.InferenceSession, "run", off)
+    call = ("export-model", weights, "-o", tmp_path / "m.onnx", "--report", tmp_path / "r.json")
+    miss = rtmap(*call, "--json", code=1)
+    assert json.loads(miss.out)["parity"]["within"] is False
+    assert "differs from torch" in miss.err and len(miss.err.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
