@@ -42,17 +42,19 @@ def render_cameras(
     occluders: Sequence[Occluder] = (),
     rng: np.random.Generator | None = None,
     ground_z: float = 0.0,
+    body: Array | None = None,
 ) -> list[Image]:
     """What the cameras of a vehicle see: one (H, W, 3) uint8 RGB image per camera.
 
     ``map_SE3_ego`` is the true pose (x, y and yaw count), ``occluders`` are vehicles in the ego
     frame, ``ground_z`` the height of the road in it (m). The body's small pitch, roll and heave,
-    the exposure and the noise are drawn from ``rng``. Distortion k1, k2, k3 is applied where a
+    the exposure and the noise are drawn from ``rng`` (``body``, `body_motion`, if the caller wants
+    to know what the vehicle does not). Distortion k1, k2, k3 is applied where a
     camera has any.
     """
     rng = rng or np.random.default_rng(0)
     cv2 = opencv()
-    body = _body_motion(style, rng)
+    body = body_motion(style, rng) if body is None else body
     x, y, yaw = xyyaw_of(map_SE3_ego)
     base = base_resolution(cameras)
     windows = [
@@ -78,7 +80,7 @@ def base_resolution(cameras: Sequence[Camera]) -> float:
     return 0.125 if focal < 420 else 0.0625
 
 
-def _body_motion(style: Style, rng: np.random.Generator) -> Array:
+def body_motion(style: Style, rng: np.random.Generator) -> Array:
     """The vehicle's unknown pitch, roll and heave as a transform of the ego frame."""
     pitch, roll = rng.normal(0, 1, 2) * (style.pitch, style.roll)
     out = np.eye(4)
