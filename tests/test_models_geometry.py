@@ -8,9 +8,9 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed (extra: train)")
 cv2 = pytest.importorskip("cv2", reason="opencv is not installed (extra: train)")
 
+from rtmap_models.answer import laplace_sigma  # noqa: E402
 from rtmap_models.bev import BevWarp, camera_centres, cell_centres  # noqa: E402
 from rtmap_models.config import load_config  # noqa: E402
-from rtmap_models.network import laplace_sigma  # noqa: E402
 from rtmap_models.pose import PoseHead, inverse3, solve3  # noqa: E402
 from rtmap_models.samples import (  # noqa: E402
     PriorNoise,

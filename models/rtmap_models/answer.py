@@ -1,0 +1,95 @@
+"""From the last layer of any decoder to the outputs of the exported graph."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rtmap_models.config import ModelConfig
+from rtmap_models.decoder import LayerOutput
+from rtmap_models.pose import PoseEstimate, PoseHead
+
+
+class Answer(NamedTuple):
+    """The outputs of the exported model (docs/model-contract.md)."""
+
+    scores: Tensor  # (B, Q, C) in 0 … 1
+    points: Tensor  # (B, Q, V, 2) metres
+    sigma: Tensor  # (B, Q, V, 2) standard deviations, metres
+    prior_score: Tensor  # (B, P) in 0 … 1
+    pose_delta: Tensor  # (B, 3)
+    pose_covariance: Tensor  # (B, 3, 3)
+
+
+class Layers(Protocol):
+    """What an answer is made of; queries are the new ones first, then the prior slots."""
+
+    @property
+    def layers(self) -> list[LayerOutput]:
+        """Every layer's output."""
+
+    @property
+    def new_count(self) -> int:
+        """How many queries are new ones."""
+
+
+class AnsweringNet(nn.Module):
+    """What all networks share: honest scales and scores, closed rings, the pose.
+
+    ``sigma_factor`` (C, 2) is measured after training: what the Laplace scale of each class (new,
+    prior) must be multiplied with to be honest. So is ``score_line`` (2, C, 2): per mode (without,
+    with a prior) and class the slope and offset that make the logits of new queries probabilities.
+    """
+
+    sigma_factor: Tensor
+    score_line: Tensor
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        self.config = config
+        self.pose = PoseHead()
+        self.register_buffer("sigma_factor", torch.ones(len(config.classes), 2))
+        line = torch.tensor([1.0, 0.0]).repeat(2, len(config.classes), 1)
+        # Not kept with the weights: measured anew for every export.
+        self.register_buffer("score_line", line, persistent=False)
+
+    def answer(
+        self, prediction: Layers, prior_points: Tensor, prior_class: Tensor, prior_mask: Tensor
+    ) -> Answer:
+        """The last layer in metres and probabilities, rings closed, unused slots zero."""
+        n, last = prediction.new_count, prediction.layers[-1]
+        classes = len(self.config.classes)
+        used = prior_mask.float()
+        one_hot = F.one_hot(prior_class.clamp(0, classes - 1), classes).float()
+        exists = last.logits[:, n:, classes].sigmoid() * used
+        aided = (used.sum(dim=1) > 0).long()
+        line = self.score_line[aided][:, None]  # (B, 1, C, 2)
+        new_scores = (last.logits[:, :n, :classes] * line[..., 0] + line[..., 1]).sigmoid()
+        scores = torch.cat([new_scores, one_hot * exists[..., None]], dim=1)
+        best = torch.cat([new_scores.argmax(-1), prior_class.clamp(0, classes - 1)], dim=1)
+        points = self._close(last.points, best)
+        scale = last.log_scale.exp() * self._factor(best, n)
+        estimate: PoseEstimate = self.pose(
+            prior_points * used[..., None, None], points[:, n:], scale[:, n:], exists
+        )
+        return Answer(scores, points, laplace_sigma(scale), exists, *estimate)
+
+    def _close(self, points: Tensor, class_id: Tensor) -> Tensor:
+        ring = torch.zeros_like(class_id, dtype=torch.bool)
+        for k in self.config.ring_ids:
+            ring = ring | (class_id == k)
+        last = torch.where(ring[..., None, None], points[:, :, :1], points[:, :, -1:])
+        return torch.cat([points[:, :, :-1], last], dim=2)
+
+    def _factor(self, class_id: Tensor, new_count: int) -> Tensor:
+        factor = self.sigma_factor[class_id]  # (B, Q, 2): new, prior
+        new, prior = factor[:, :new_count, 0], factor[:, new_count:, 1]
+        return torch.cat([new, prior], dim=1)[..., None, None]
+
+
+def laplace_sigma(scale: Tensor) -> Tensor:
+    """Standard deviation of a Laplace distribution of scale b: √2 · b, the only place."""
+    return scale * 2.0**0.5
