@@ -75,7 +75,12 @@ class AnsweringNet(nn.Module):
         estimate: PoseEstimate = self.pose(
             prior_points * used[..., None, None], points[:, n:], scale[:, n:], exists
         )
-        return Answer(scores, points, laplace_sigma(scale), exists, *estimate)
+        delta = self.correction(prediction, estimate)
+        return Answer(scores, points, laplace_sigma(scale), exists, delta, estimate.covariance)
+
+    def correction(self, prediction: Layers, estimate: PoseEstimate) -> Tensor:
+        """(B, 3) the pose that is answered with; its covariance is always the least squares'."""
+        return estimate.delta
 
     def _close(self, points: Tensor, class_id: Tensor) -> Tensor:
         ring = torch.zeros_like(class_id, dtype=torch.bool)

@@ -98,7 +98,8 @@ class PaperConfig(ModelConfig):
     raster_channels: int  # of the raster encoder's input
     backbone: str  # "resnet18" or "resnet50"
     backbone_norm: str  # "batch" (from scratch) or "frozen" (with weights that the user brings)
-    image_width: int  # channels of the image features that are lifted
+    image_stride: int  # pixels per cell of the image features that are lifted: 8, 16 or 32
+    image_width: int  # channels of the image features
     heights_m: tuple[float, ...]  # where a bird's-eye cell looks into the images
     bev_blocks: int
     width: int  # channels of the bird's-eye map, of queries and of points
@@ -129,6 +130,11 @@ class PaperConfig(ModelConfig):
         return self.encoder == "camera"
 
     @property
+    def stages(self) -> int:
+        """How many stages of the ResNet reach the image features."""
+        return {8: 3, 16: 2, 32: 1}[self.image_stride]
+
+    @property
     def bev_size(self) -> tuple[int, int]:
         """Rows (y) and columns (x) of the bird's-eye map."""
         rows, columns = self.picture_size
@@ -150,6 +156,8 @@ class PaperConfig(ModelConfig):
                 return f"{name} must be at least 1"
         if self.width % self.heads or not self.heights_m or self.deform_points < 1:
             return "width must be a multiple of heads; a height and a deform point are needed"
+        if any(size % 32 for size in self.image_size) or self.image_stride not in (8, 16, 32):
+            return "image_size must be multiples of 32, image_stride 8, 16 or 32"
         if any(size % 4 for size in self.picture_size):
             return "the picture must have multiples of 4 cells: change cell_m"
         return super().check()
@@ -208,4 +216,5 @@ def load_config(name: str | Path = "rtmap-tiny") -> ModelConfig:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise BadInput(path, f"not TOML: {error}", "mend the file") from error
+    values.pop("training", None)  # how to train it, not what it is: rtmap_models.recipe
     return config_from_dict(values, path)

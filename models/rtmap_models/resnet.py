@@ -91,7 +91,7 @@ def _shortcut(inputs: int, outputs: int, stride: int, norm: Norm) -> nn.Sequenti
 
 
 class ResNet(nn.Module):
-    """Normalised images → the maps of the last two stages."""
+    """Normalised images → the maps of the last three stages."""
 
     def __init__(self, kind: str, norm: str = "batch"):
         super().__init__()
@@ -108,20 +108,21 @@ class ResNet(nn.Module):
                 blocks.append(block(inputs, width, stride, make))
                 inputs = width * block.expansion
             self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
-        self.widths = (inputs // 2, inputs)
+        self.widths = (inputs // 4, inputs // 2, inputs)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, 3, H, W) → (B, widths[0], H/16, W/16) and (B, widths[1], H/32, W/32).
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(B, 3, H, W) → (B, widths[k], H/s, W/s) at strides s = 8, 16, 32.
 
         Every stride centres cell i of its output on cell 2 i of its input: cell i of a map of
         stride s lies at pixel s · i, not in the middle of its s pixels.
         """
         x = F.max_pool2d(F.relu(self.bn1(self.conv1(x))), 3, 2, 1)
-        x = self.layer3(self.layer2(self.layer1(x)))
-        return x, self.layer4(x)
+        x8 = self.layer2(self.layer1(x))
+        x16 = self.layer3(x8)
+        return x8, x16, self.layer4(x16)
 
 
 def normalize_images(images: Tensor) -> Tensor:
