@@ -285,7 +285,11 @@ class _Work:
         (a, b), (d, c) = ends
         if max(np.hypot(*(a - d)), np.hypot(*(b - c))) > 1.5 * depth:
             return None
-        return np.array([a, b, c, d, a])
+        ring = np.array([a, b, c, d, a])
+        # Beside a driveway the ends would run over the curb.
+        line = shapely.linestrings(ring)
+        road = shapely.intersection(self.surface, line.envelope.buffer(1.0)).buffer(0.04)
+        return ring if shapely.contains(road, line) else None
 
     def _insert_line(self, class_name: str) -> bool:
         """A line on asphalt beside the way, clear of every other line and crossing."""

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
-from rtmap_cli.steps.simulate.towns.town_streets import Street
-
-if TYPE_CHECKING:
-    from rtmap_cli.steps.simulate.towns.town import Junction
+from rtmap_cli.steps.simulate.towns.junctions import Junction
+from rtmap_cli.steps.simulate.towns.streets import UNDRIVEN, Street
 
 Array = NDArray[np.float64]
 
@@ -41,14 +37,14 @@ def _pieces(index: int, street: Street, junctions: list[Junction]) -> list[Lane]
         own = [a for a in junction.arms if a.street == index]
         if not own:
             continue
-        middle = float(shapely.linestrings(street.line).project(shapely.points(junction.place)))
-        low = high = middle
+        low = high = junction.stations[index]
         for arm in own:
-            edge = np.mean(arm.clear) + arm.direction * max(arm.stop, 1.0)
+            edge = arm.edge + arm.direction * max(arm.stop, 1.0)
             low, high = min(low, float(edge)), max(high, float(edge))
         stops.append((float(low), float(high), k))
     stops.sort()
-    cuts = [(-1.0, 0.0, -1), *stops, (street.length, street.length + 1, -1)]
+    first, last = (0.0 if closed else UNDRIVEN for closed in street.closed)
+    cuts = [(-1.0, first, -1), *stops, (street.length - last, street.length + 1, -1)]
     out: list[Lane] = []
     for (_, start, leaves), (end, _, enters) in pairwise(cuts):
         if end - start < 4:
