@@ -19,87 +19,37 @@ import onnxruntime  # noqa: E402
 from rtmap_models.bev import normalize_picture  # noqa: E402
 from rtmap_models.calibrate import calibrate  # noqa: E402
 from rtmap_models.checkpoint import load_checkpoint, load_network  # noqa: E402
-from rtmap_models.config import CONFIGS, load_config  # noqa: E402
+from rtmap_models.config import load_config  # noqa: E402
 from rtmap_models.criterion import LossWeights, compute_losses  # noqa: E402
-from rtmap_models.dataset import (  # noqa: E402
-    Frames,
-    collate,
-    make_sample,
-    window_half,
-    window_size,
-    write_shard,
-)
+from rtmap_models.dataset import Frames, collate, make_sample  # noqa: E402
 from rtmap_models.export import OUTPUTS, example_inputs, parity  # noqa: E402
 from rtmap_models.matcher import Matcher  # noqa: E402
 from rtmap_models.network import RTMapNet  # noqa: E402
-from rtmap_models.samples import Scene  # noqa: E402
+from rtmap_models.recipe import Recipe  # noqa: E402
 from rtmap_models.train import TrainOptions, train  # noqa: E402
+from training_frames import painted_frames, tiny_config  # noqa: E402
 
 from rtmap_cli.errors import BadInput  # noqa: E402
-
-TINY = {
-    "cell_m = 0.25": "cell_m = 0.75",
-    "supersample = 2": "supersample = 1",
-    "[24, 48, 96, 128]": "[8, 8, 16, 16]",
-    "fine_width = 24": "fine_width = 8",
-    "coarse_width = 64": "coarse_width = 16",
-    "query_width = 128": "query_width = 32",
-    "point_width = 48": "point_width = 16",
-    "layers = 3": "layers = 1",
-    "new_queries = 50": "new_queries = 12",
-    "[128, 224]": "[32, 48]",
-    'name = "rtmap-tiny"': 'name = "rtmap-test"',
-}
 
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The default configuration with every size cut down."""
-    text = (CONFIGS / "rtmap-tiny.toml").read_text()
-    for old, new in TINY.items():
-        assert old in text
-        text = text.replace(old, new)
-    path = tmp_path_factory.mktemp("config") / "test.toml"
-    path.write_text(text)
-    return path
+    return tiny_config(tmp_path_factory.mktemp("config"))
 
 
 @pytest.fixture(scope="module")
 def frames(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Twelve painted frames: a straight road of two lanes, some with a crossing."""
-    config, rng = load_config(tiny), np.random.default_rng(0)
-    (rows, columns), half = window_size(config), np.array(window_half(config))
-    pictures = np.full((12, rows, columns, 4), 60, np.uint8)
-    scenes = []
-    for picture in pictures:
-        y = rng.uniform(-4, 4)
-        lines = [
-            (2, np.array([[-60, y - 6], [60, y - 6]])),
-            (2, np.array([[-60, y + 6], [60, y + 6]])),
-        ]
-        lines.append((1, np.array([[-60, y], [60, y]])))
-        if rng.random() < 0.5:
-            x = rng.uniform(-20, 20)
-            ring = [[x, y - 6], [x + 4, y - 6], [x + 4, y + 6], [x, y + 6], [x, y - 6]]
-            lines.append((0, np.array(ring)))
-        canvas = np.ascontiguousarray(picture)
-        for _, p in lines:
-            pixel = np.round((p + half) / config.cell_m - 0.5).astype(np.int32)
-            cv2.polylines(canvas, [pixel], False, (220, 220, 220, 200))
-        picture[...] = canvas
-        offsets = np.cumsum([0] + [len(p) for _, p in lines])
-        classes = np.array([c for c, _ in lines])
-        scenes.append(Scene(np.concatenate([p for _, p in lines]), offsets, classes))
-    folder = tmp_path_factory.mktemp("frames")
-    write_shard(folder, "painted", pictures, scenes, {})
-    return folder
+    return painted_frames(tmp_path_factory.mktemp("frames"), tiny)
 
 
 @pytest.fixture(scope="module")
 def weights(tiny: Path, frames: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Sixty steps of training."""
     path = tmp_path_factory.mktemp("weights") / "weights.pt"
-    options = TrainOptions(frames, path, steps=60, warmup=10, log_every=20, bf16=False, rate=3e-3)
+    recipe = Recipe(warmup=10, precision="fp32", rate=3e-3)
+    options = TrainOptions((frames,), path, recipe, steps=60, log_every=20)
     train(load_config(tiny), options)
     return path
 
@@ -185,7 +135,7 @@ def test_export_refuses_to_overwrite(rtmap, model: Path, weights: Path) -> None:
 
 def test_resume_goes_on(tiny: Path, frames: Path, weights: Path, tmp_path: Path) -> None:
     path = tmp_path / "more.pt"
-    options = TrainOptions(frames, path, steps=62, resume=weights, bf16=False)
+    options = TrainOptions((frames,), path, Recipe(precision="fp32"), steps=62, resume=weights)
     train(load_config(tiny), options)
     assert load_checkpoint(path)[1]["step"] == 62
 

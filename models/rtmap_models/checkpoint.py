@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import pickle
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor, nn
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.tables import whole_file
+from rtmap_models.architecture import build_network
 from rtmap_models.config import ModelConfig, config_from_dict
-from rtmap_models.network import RTMapNet
 
 FORMAT = "rtmap.weights/1"
 
@@ -42,15 +44,82 @@ def load_checkpoint(path: Path) -> tuple[ModelConfig, dict[str, Any]]:
         raise BadInput(path, f"not a checkpoint: {first}", "train again") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise BadInput(path, "not a checkpoint of rtmap train", f"expected format {FORMAT}")
-    return config_from_dict(dict(content["config"]), path), content
+    config = content.get("config")
+    if not isinstance(config, dict) or not isinstance(content.get("average"), Mapping):
+        raise BadInput(path, "not a checkpoint: configuration or weights missing", "train again")
+    return config_from_dict(dict(config), path), content
 
 
-def load_network(path: Path) -> tuple[RTMapNet, dict[str, Any]]:
+def load_resumable(path: Path, config: ModelConfig) -> dict[str, Any]:
+    """The content of a checkpoint from which training of ``config`` can go on; BadInput when it is
+    of another configuration or holds the averaged weights only."""
+    found, content = load_checkpoint(path)
+    if found != config:
+        old, new = found.to_dict(), config.to_dict()
+        odd = ", ".join(sorted(k for k in old.keys() | new.keys() if old.get(k) != new.get(k)))
+        raise BadInput(
+            path,
+            f"another configuration than the one to train ({odd})",
+            "use --init, or start anew",
+        )
+    if not {"network", "optimizer", "step", "seconds"} <= set(content):
+        raise BadInput(path, "holds averaged weights only, not where training stood", "use --init")
+    return content
+
+
+def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
     """The averaged network of a checkpoint in evaluation mode, and the checkpoint's content."""
     config, content = load_checkpoint(path)
-    network = RTMapNet(config)
+    network = build_network(config)
     try:
         network.load_state_dict(content["average"])
     except (KeyError, RuntimeError) as error:
         raise BadInput(path, "the weights do not fit the configuration", "train again") from error
     return network.eval(), content
+
+
+def start_from(network: nn.Module, source: str, partial: bool = False) -> list[str]:
+    """Give a network the weights of ``source``: a checkpoint (its averaged weights), an ONNX file
+    of ``rtmap export-model``, or the name of a model of the zoo.
+
+    BadInput when names or shapes differ from the network's (another configuration); with
+    ``partial`` what differs keeps its fresh value, and its names are returned.
+    """
+    state = _read_state(source)
+    own = network.state_dict()
+    fitting = {k: v for k, v in state.items() if k in own and v.shape == own[k].shape}
+    odd = sorted((own.keys() | state.keys()) - fitting.keys())
+    if odd and not partial:
+        raise BadInput(
+            source,
+            f"{len(odd)} tensors do not fit this configuration ({_misfit(odd[0], state, own)})",
+            "train the configuration that it was made with, or pass --init-partial",
+        )
+    if not fitting:
+        raise BadInput(source, "none of its tensors fits this configuration")
+    network.load_state_dict(fitting, strict=False)
+    return [name for name in odd if name in own]
+
+
+def _misfit(name: str, state: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> str:
+    def shape(tensors: Mapping[str, Tensor]) -> str:
+        return "×".join(map(str, tensors[name].shape)) or "1" if name in tensors else "absent"
+
+    return f"{name}: there {shape(state)}, here {shape(own)}"
+
+
+def _read_state(source: str) -> Mapping[str, Tensor]:
+    path = Path(source)
+    if path.suffix != ".onnx" and not path.exists() and "/" not in source and not path.suffix:
+        from rtmap_cli.steps.infer.model import find_model
+
+        path = find_model(source)
+    if path.suffix == ".onnx":
+        from rtmap_models.onnx_weights import read_weights
+
+        state = read_weights(path)
+        if state is None:
+            raise BadInput(path, "holds no weights to train on", "give a checkpoint instead")
+        return state
+    average: Mapping[str, Tensor] = load_checkpoint(path)[1]["average"]
+    return average

@@ -1,16 +1,9 @@
-"""Training frames on disk (bird's-eye pictures and their elements) and batches of samples.
-
-A cache folder holds shards; a shard is three files that appear whole: ``NAME.npy`` uint8
-(n, rows, columns, 4), a picture wider than the range so that it can be turned and shifted;
-``NAME.npz`` with the elements; ``NAME.json``, written last, that says what they are.
-"""
+"""Samples and batches: frames moved and recoloured, with a wrong prior and their targets."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+import math
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -18,8 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rtmap_cli.errors import BadInput
-from rtmap_cli.tables import whole_file
 from rtmap_models.config import ModelConfig
 from rtmap_models.samples import (
     Array,
@@ -34,108 +25,64 @@ from rtmap_models.samples import (
     rotation,
     segmentation_target,
 )
+from rtmap_models.shards import (
+    SCENE_MARGIN_M,
+    Frame,
+    Frames,
+    crop_window,
+    window_half,
+    window_size,
+    write_shard,
+)
 
-WINDOW_MARGIN_M = (6.0, 8.0)
-"""How much the cached picture is wider than the range on each side, x and y."""
-
-SCENE_MARGIN_M = 14.0
-"""Elements are kept this far outside the range, for augmentation."""
-
-
-def window_half(config: ModelConfig) -> tuple[float, float]:
-    """Half extent of the cached picture, metres."""
-    half_x, half_y = config.half_range
-    return half_x + WINDOW_MARGIN_M[0], half_y + WINDOW_MARGIN_M[1]
-
-
-def window_size(config: ModelConfig) -> tuple[int, int]:
-    """Rows and columns of the cached picture."""
-    half_x, half_y = window_half(config)
-    return round(2 * half_y / config.cell_m), round(2 * half_x / config.cell_m)
-
-
-def write_shard(
-    folder: Path, name: str, pictures: NDArray[np.uint8], scenes: list[Scene], info: dict[str, Any]
-) -> None:
-    """Write one shard; readers see it when its JSON file is there."""
-    with whole_file(folder / f"{name}.npy") as path, path.open("wb") as stream:
-        np.save(stream, pictures, allow_pickle=False)
-    counts = [len(s.classes) for s in scenes]
-    lengths = [np.diff(s.offsets) for s in scenes]
-    with whole_file(folder / f"{name}.npz") as path, path.open("wb") as stream:
-        np.savez(
-            stream,
-            frame=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-            length=np.concatenate([*lengths, np.zeros(0)]).astype(np.int64),
-            classes=np.concatenate([*(s.classes for s in scenes), np.zeros(0)]).astype(np.int64),
-            points=np.concatenate([*(s.points for s in scenes), np.zeros((0, 2))]).astype("f4"),
-        )
-    with whole_file(folder / f"{name}.json") as path:
-        path.write_text(json.dumps({"frames": len(scenes)} | info, indent=1), encoding="utf-8")
+__all__ = [
+    "SCENE_MARGIN_M",
+    "Augmentation",
+    "Batch",
+    "Frame",
+    "Frames",
+    "Sample",
+    "augment",
+    "collate",
+    "crop_window",
+    "make_sample",
+    "window_half",
+    "window_size",
+    "write_shard",
+]
 
 
-class Frames:
-    """Random access to the frames of a cache folder; ``refresh`` finds new shards."""
+@dataclass(frozen=True)
+class Augmentation:
+    """How training frames are varied: the ego frame turned (standard deviation ``turn_deg``),
+    shifted (``shift_m`` along x and y) and mirrored, in a share ``still`` of the samples mirrored
+    only; colours multiplied by 1 ± ``contrast`` and moved by up to ``brightness``, each channel by
+    up to ``tint`` more. A share ``hidden`` of the samples hides its prior from the new queries."""
 
-    def __init__(self, folder: str | Path, config: ModelConfig):
-        self.folder, self.size = Path(folder), window_size(config)
-        self.names: list[str] = []
-        self.pictures: list[NDArray[np.uint8]] = []
-        self.tables: list[dict[str, NDArray[Any]]] = []
-        self.starts = np.zeros(1, np.int64)
-        self.refresh()
-
-    def refresh(self) -> None:
-        """Open shards that have appeared since."""
-        if not self.folder.is_dir():
-            raise BadInput(self.folder, "no such folder", "make one with rtmap train --frames")
-        fresh = sorted({p.stem for p in self.folder.glob("*.json")} - set(self.names))
-        for name in fresh:
-            try:
-                picture = np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
-                with np.load(self.folder / f"{name}.npz", allow_pickle=False) as data:
-                    table = {k: data[k] for k in ("frame", "length", "classes", "points")}
-            except (OSError, ValueError, KeyError) as error:
-                where = self.folder / f"{name}.npy"
-                raise BadInput(where, f"unreadable shard: {error}", "delete it") from error
-            if picture.shape[1:3] != self.size:
-                raise BadInput(
-                    self.folder / f"{name}.npy",
-                    f"pictures of {picture.shape[1:3]}, the configuration needs {self.size}",
-                    "use another --data folder",
-                )
-            table["start"] = np.concatenate([[0], np.cumsum(table["length"])])
-            self.names.append(name)
-            self.pictures.append(picture)
-            self.tables.append(table)
-        self.starts = np.concatenate([[0], np.cumsum([len(p) for p in self.pictures])])
-
-    def __len__(self) -> int:
-        return int(self.starts[-1])
-
-    def __getitem__(self, index: int) -> tuple[NDArray[np.uint8], Scene]:
-        """Wide picture (rows, columns, 4) and the scene of one frame."""
-        shard = int(np.searchsorted(self.starts, index, side="right")) - 1
-        row, table = index - self.starts[shard], self.tables[shard]
-        first, last = table["frame"][row], table["frame"][row + 1]
-        begin, end = table["start"][first], table["start"][last]
-        offsets = (table["start"][first : last + 1] - begin).astype(np.int64)
-        points = table["points"][begin:end].astype(np.float64)
-        return np.asarray(self.pictures[shard][row]), Scene(
-            points, offsets, table["classes"][first:last]
-        )
+    turn_deg: float = 4.0
+    shift_m: tuple[float, float] = (1.0, 0.8)
+    still: float = 0.3
+    mirror: bool = True
+    contrast: float = 0.25
+    brightness: float = 20.0
+    tint: float = 6.0
+    hidden: float = 0.6
 
 
 @dataclass
 class Sample:
-    """One frame ready for a batch. ``picture`` uint8 (H, W, 4); see `Batch` for the rest."""
+    """One frame ready for a batch. ``picture`` uint8 (H, W, 4); ``scene`` the elements also
+    outside the range; see `Batch` for the rest."""
 
     picture: NDArray[np.uint8]
+    scene: Scene
     truth: Pieces
     prior: Prior | None
     visible: bool
     gain: Array
     offset: Array
+    images: NDArray[np.uint8] | None = None
+    ego_to_image: NDArray[np.float32] | None = None
 
 
 @dataclass
@@ -158,59 +105,138 @@ class Batch:
     segmentation: Tensor  # (B, C, H/2, W/2)
     heat: Tensor  # (B, C, h, w)
     cells: Tensor  # (M, 5) sample, class, row, column, truth
+    images: Tensor | None = None  # (B, N, H, W, 3) uint8; an absent camera is zero
+    ego_to_image: Tensor | None = None  # (B, N, 3, 4) float32; an absent camera is zero
 
+    def to(self, device: torch.device | str) -> Batch:
+        """The batch with every tensor on a device (numpy fields stay)."""
+        moved = {
+            f.name: value.to(device, non_blocking=True)
+            for f in fields(self)
+            if isinstance(value := getattr(self, f.name), Tensor)
+        }
+        return replace(self, **moved)
 
-def crop_window(picture: NDArray[np.uint8], config: ModelConfig) -> NDArray[np.uint8]:
-    """The range itself, out of the wider cached picture."""
-    rows, columns = config.picture_size
-    top, left = (round(m / config.cell_m) for m in (WINDOW_MARGIN_M[1], WINDOW_MARGIN_M[0]))
-    return picture[top : top + rows, left : left + columns]
+    def pin_memory(self) -> Batch:
+        """The batch in page-locked memory, from which a copy to a GPU need not wait."""
+        pinned = {
+            f.name: value.pin_memory()
+            for f in fields(self)
+            if isinstance(value := getattr(self, f.name), Tensor)
+        }
+        return replace(self, **pinned)
 
 
 def augment(
-    picture: NDArray[np.uint8], scene: Scene, config: ModelConfig, rng: np.random.Generator
-) -> tuple[NDArray[np.uint8], Scene]:
-    """Mirror, turn (σ 4°) and shift (σ 1 m, 0.8 m) picture and scene alike."""
-    flip = np.diag(rng.choice([1.0, -1.0], 2))
-    angle, shift = rng.normal(0, 0.07), rng.normal(0, 1, 2) * [1.0, 0.8]
-    if rng.random() < 0.3:
+    frame: Frame, config: ModelConfig, rng: np.random.Generator, how: Augmentation
+) -> Frame:
+    """Mirror, turn and shift everything in a frame alike; the picture is cut to the range.
+
+    With p' = M p + s the ego coordinates of the moved frame, a projection P becomes
+    P · [M⁻¹, -M⁻¹ s]; where M mirrors, the images are mirrored too, so that cameras stay cameras.
+    """
+    flip = np.diag(rng.choice([1.0, -1.0], 2)) if how.mirror else np.eye(2)
+    angle = rng.normal(0, math.radians(how.turn_deg))
+    shift = rng.normal(0, 1, 2) * how.shift_m
+    if rng.random() < how.still:
         angle, shift = 0.0, np.zeros(2)
     matrix = rotation(angle) @ flip
-    inverse = np.linalg.inv(matrix)
+    inverse: Array = np.linalg.inv(matrix).astype(np.float64)
+    moved = Frame(
+        _moved_picture(frame.picture, inverse, shift, config), frame.scene.moved(matrix, shift)
+    )
+    if frame.images is None or frame.ego_to_image is None:
+        return moved
+    images, projections = _moved_cameras(frame.images, frame.ego_to_image, inverse, shift)
+    return moved._replace(images=images, ego_to_image=projections)
+
+
+def _moved_picture(
+    picture: NDArray[np.uint8], inverse: Array, shift: Array, config: ModelConfig
+) -> NDArray[np.uint8]:
     cell, half = config.cell_m, np.array(config.half_range)
     origin = inverse @ (0.5 * cell - half - shift)  # the first cell's centre in the old frame
     offset = (origin + window_half(config)) / cell - 0.5
     warp = np.column_stack([inverse, offset])
     rows, columns = config.picture_size
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(picture, warp, (columns, rows), flags=flags), scene.moved(matrix, shift)
+    return np.asarray(cv2.warpAffine(picture, warp, (columns, rows), flags=flags), np.uint8)
+
+
+def _moved_cameras(
+    images: NDArray[np.uint8], projections: NDArray[np.float32], inverse: Array, shift: Array
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    back = np.eye(4)
+    back[:2, :2], back[:2, 3] = inverse, -inverse @ shift
+    out = projections @ back
+    if np.linalg.det(inverse) < 0:
+        images = np.ascontiguousarray(images[:, :, ::-1])
+        out[:, 0] = (images.shape[2] - 1) * out[:, 2] - out[:, 0]
+    return images, out.astype(np.float32)
+
+
+def recoloured(images: NDArray[np.uint8], gain: Array, offset: Array) -> NDArray[np.uint8]:
+    """(N, H, W, 3) images with gain and offset per channel about 110; black (unseen) stays."""
+    values = (np.arange(256)[:, None] - 110) * gain + 110 + offset
+    values[0] = 0
+    table = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    flat = images.reshape(-1, images.shape[2], 3)
+    return np.asarray(cv2.LUT(flat, table[None]), np.uint8).reshape(images.shape)
 
 
 def make_sample(
-    frame: tuple[NDArray[np.uint8], Scene],
+    frame: Frame,
     config: ModelConfig,
     rng: np.random.Generator,
     noise: PriorNoise | None = None,
     prior: str = "both",
     train: bool = True,
+    augmentation: Augmentation | None = None,
 ) -> Sample:
-    """One sample. ``prior`` is "none", "seen", "hidden" or "both" (hidden in 60 % of samples):
-    a hidden prior is refined beside new queries that do not know of it."""
-    picture, scene = frame
+    """One sample. ``prior`` is "none", "seen", "hidden" or "both" (hidden in some samples): a
+    hidden prior is refined beside new queries that do not know of it. Without ``train`` nothing is
+    varied."""
+    how = augmentation or Augmentation()
     gain, offset = np.ones(3), np.zeros(3)
     if train:
-        picture, scene = augment(picture, scene, config, rng)
-        gain = np.full(3, rng.uniform(0.75, 1.25))
-        offset = rng.uniform(-20, 20) + rng.uniform(-6, 6, 3)
+        frame = augment(frame, config, rng, how)
+        gain = np.full(3, 1 + rng.uniform(-how.contrast, how.contrast))
+        offset = rng.uniform(-how.brightness, how.brightness) + rng.uniform(-how.tint, how.tint, 3)
+        if frame.images is not None:
+            frame = frame._replace(images=recoloured(frame.images, gain, offset))
     else:
-        picture = crop_window(picture, config)
-    truth = clip(scene, config)
+        frame = frame._replace(picture=crop_window(frame.picture, config))
+    truth = clip(frame.scene, config)
     if prior == "both":
-        prior = "seen" if rng.random() < 0.4 else "hidden"
+        prior = "hidden" if rng.random() < how.hidden else "seen"
     made = None
     if prior != "none":
-        made = make_prior(scene, truth, config, noise or PriorNoise(), rng)
-    return Sample(picture, truth, made, prior == "seen", gain, offset)
+        made = make_prior(frame.scene, truth, config, noise or PriorNoise(), rng)
+    return Sample(
+        frame.picture,
+        frame.scene,
+        truth,
+        made,
+        prior == "seen",
+        gain,
+        offset,
+        frame.images,
+        frame.ego_to_image,
+    )
+
+
+def _stacked_cameras(samples: list[Sample]) -> tuple[Tensor | None, Tensor | None]:
+    """Images and projections of all samples, padded with absent cameras to the most."""
+    cameras = [(s.images, s.ego_to_image) for s in samples]
+    shown = [(i, p) for i, p in cameras if i is not None and p is not None]
+    if len(shown) < len(samples):
+        return None, None
+    count = max(len(i) for i, _ in shown)
+    images = np.zeros((len(shown), count, *shown[0][0].shape[1:]), np.uint8)
+    projections = np.zeros((len(shown), count, 3, 4), np.float32)
+    for b, (image, projection) in enumerate(shown):
+        images[b, : len(image)], projections[b, : len(projection)] = image, projection
+    return torch.from_numpy(images), torch.from_numpy(projections)
 
 
 def collate(samples: list[Sample], config: ModelConfig) -> Batch:
@@ -247,6 +273,7 @@ def collate(samples: list[Sample], config: ModelConfig) -> Batch:
     gain = torch.from_numpy(np.stack([s.gain for s in samples])).float()[..., None, None]
     offset = torch.from_numpy(np.stack([s.offset for s in samples])).float()[..., None, None]
     colour = (picture[:, :3] - 110) * gain + 110 + offset
+    images, ego_to_image = _stacked_cameras(samples)
     tensor = torch.from_numpy
     return Batch(
         picture=torch.cat([colour, picture[:, 3:]], dim=1),
@@ -265,4 +292,6 @@ def collate(samples: list[Sample], config: ModelConfig) -> Batch:
         segmentation=tensor(np.stack([segmentation_target(s.truth, config) for s in samples])),
         heat=tensor(np.stack([h for h, _ in heats])),
         cells=tensor(np.concatenate(cells).astype(np.int64)),
+        images=images,
+        ego_to_image=ego_to_image,
     )

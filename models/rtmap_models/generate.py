@@ -9,8 +9,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,24 +25,15 @@ from rtmap_cli.steps.simulate.images.style import make_style
 from rtmap_cli.steps.simulate.towns.town import Town, make_town
 from rtmap_cli.steps.simulate.worlds.world import world_from_map
 from rtmap_cli.steps.simulate.worlds.world_objects import random_occluders
-from rtmap_models.bev import BevWarp
 from rtmap_models.config import ModelConfig
-from rtmap_models.dataset import SCENE_MARGIN_M, window_half, window_size, write_shard
 from rtmap_models.rigs import sample_rig
-from rtmap_models.samples import Array, Scene
+from rtmap_models.samples import Array
+from rtmap_models.shards import write_shard
+from rtmap_models.views import View, scene_at, wide_picture, wide_warp
 
 FRAMES_PER_TOWN = 24
 TOWN_SIZES = (150.0, 220.0, 320.0)
-
-
-@dataclass(frozen=True)
-class View:
-    """One frame as the network gets it, and the truth around it."""
-
-    images: NDArray[np.uint8]  # (N, H, W, 3)
-    ego_to_image: NDArray[np.float32]  # (N, 3, 4)
-    scene: Scene
-    map_SE3_ego: Array
+TOWNS_PER_SEED = 100_000
 
 
 def town_views(config: ModelConfig, seed: int, count: int) -> Iterator[View]:
@@ -78,18 +69,6 @@ def random_pose(town: Town, rng: np.random.Generator) -> Array:
     return se3_from_xyyaw(x - side * np.sin(yaw), y + side * np.cos(yaw), yaw)
 
 
-def scene_at(index: MapIndex, pose: Array, config: ModelConfig) -> Scene:
-    """The elements around a pose, also a little outside the range."""
-    local = index.crop(pose, config.range_m, margin=SCENE_MARGIN_M)
-    local = [e for e in local if e.class_name in config.classes]
-    points = [e.points[:, :2] for e in local]
-    return Scene(
-        np.concatenate([*points, np.zeros((0, 2))]),
-        np.cumsum([0] + [len(p) for p in points]).astype(np.int64),
-        np.array([config.classes.index(e.class_name) for e in local], dtype=np.int64),
-    )
-
-
 def generate(
     config: ModelConfig,
     folder: Path,
@@ -98,28 +77,31 @@ def generate(
     workers: int,
     report: Callable[[str], None],
     per_town: int = FRAMES_PER_TOWN,
+    keep_images: bool | None = None,
 ) -> None:
     """Fill ``folder`` with towns ``seed · 100000 + 0, 1, …`` until it holds ``frames`` frames.
 
     Shards that are there already are kept: an interrupted run goes on where it stopped.
+    ``keep_images`` keeps the camera images too (default: where the network needs them).
     """
     folder.mkdir(parents=True, exist_ok=True)
     sizes = [min(per_town, frames - start) for start in range(0, frames, per_town)]
+    keep = config.needs_images if keep_images is None else keep_images
     jobs = [
-        (config, folder, seed * 100_000 + k, count)
+        TownJob(config, folder, seed * TOWNS_PER_SEED + k, count, keep)
         for k, count in enumerate(sizes)
-        if not (folder / f"{_name(seed * 100_000 + k)}.json").exists()
+        if not (folder / f"{town_name(seed * TOWNS_PER_SEED + k)}.json").exists()
     ]
     if not jobs:
         return
-    report(f"rendering {sum(j[3] for j in jobs)} frames of {len(jobs)} towns into {folder}")
+    report(f"rendering {sum(j.frames for j in jobs)} frames of {len(jobs)} towns into {folder}")
     workers = min(workers, len(jobs))
     if workers == 1:
-        made = map(_one_town, jobs)
+        made = map(make_town_shard, jobs)
         _watch(made, len(jobs), report)
         return
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        _watch(pool.imap_unordered(_one_town, jobs), len(jobs), report)
+        _watch(pool.imap_unordered(make_town_shard, jobs), len(jobs), report)
 
 
 def _watch(made: Iterator[str], count: int, report: Callable[[str], None]) -> None:
@@ -128,26 +110,35 @@ def _watch(made: Iterator[str], count: int, report: Callable[[str], None]) -> No
             report(f"{done} of {count} towns ({name})")
 
 
-def _name(seed: int) -> str:
+def town_name(seed: int) -> str:
     return f"town-{seed:07d}"
 
 
-def _one_town(job: tuple[ModelConfig, Path, int, int]) -> str:
-    config, folder, seed, count = job
+class TownJob(NamedTuple):
+    """One shard to make: the frames of the town of a seed."""
+
+    config: ModelConfig
+    folder: Path
+    seed: int
+    frames: int
+    keep_images: bool
+
+
+def make_town_shard(job: TownJob) -> str:
+    """Render one town and write its shard; returns the shard's name."""
+    config = job.config
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     torch.set_num_threads(1)
-    warp = BevWarp(*window_half(config), *window_size(config), config.supersample)
-    pictures, scenes = [], []
-    for view in town_views(config, seed, count):
-        pictures.append(wide_picture(warp, view))
-        scenes.append(view.scene)
-    write_shard(folder, _name(seed), np.stack(pictures), scenes, {"town": seed})
-    return _name(seed)
-
-
-@torch.no_grad()
-def wide_picture(warp: BevWarp, view: View) -> NDArray[np.uint8]:
-    """(rows, columns, 4) bird's-eye picture of a view, by the module that the graph runs."""
-    images = torch.from_numpy(view.images)[None]
-    picture = warp(images, torch.from_numpy(view.ego_to_image)[None])[0]
-    return picture.round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+    warp = wide_warp(config)
+    pictures, views = [], []
+    for view in town_views(config, job.seed, job.frames):
+        pictures.append(wide_picture(warp, view.images, view.ego_to_image))
+        views.append(view)
+    kept: dict[str, Any] = {}
+    if job.keep_images:
+        kept["images"] = np.stack([v.images for v in views])
+        kept["ego_to_image"] = np.stack([v.ego_to_image for v in views])
+    scenes = [v.scene for v in views]
+    name = town_name(job.seed)
+    write_shard(job.folder, name, np.stack(pictures), scenes, {"town": job.seed}, **kept)
+    return name
