@@ -29,6 +29,7 @@ COMMANDS: dict[str, Any] = {
         "Bring in maps and detections of other formats.",
         {
             "av2": ("import_av2", "The vector map of an Argoverse 2 log becomes a map."),
+            "nuscenes": ("import_nuscenes", "A vector map of nuScenes becomes a map."),
             "geojson": ("import_geojson", "A GeoJSON file becomes a map."),
             "detections": ("import_detections", "Detections of any model become a run."),
         },
@@ -59,6 +60,7 @@ COMMANDS: dict[str, Any] = {
         },
     ),
     "check-log": ("check_log", "Name what is wrong with a log."),
+    "picture": ("picture", "The cameras of a frame with lines drawn on the road."),
     "train": ("train", "Train the network (extra: train)."),
     "export-model": ("export_model", "Export trained weights to one ONNX file (extra: train)."),
     "demo": ("demo", "A town, an outdated map, three drives, three cycles."),

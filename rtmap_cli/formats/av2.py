@@ -53,7 +53,8 @@ class Av2Log:
 
     ``poses`` (n, 4, 4) map_SE3_ego in UTM at ``pose_times``. Frames lie at the times of the front
     camera's images; without images at the annotated moments (10 Hz); without either every 0.1 s.
-    ``notes`` says what the log lacks. Cameras expose up to 25 ms apart; a frame has one pose.
+    ``notes`` says what the log lacks. Cameras expose up to 25 ms apart: each image has the pose of
+    its own time.
     """
 
     def __init__(
@@ -167,11 +168,13 @@ class Av2Log:
         times = {name: np.array(list(files), np.int64) for name, files in self.images.items()}
         sweep_times = np.array(list(self.sweeps), np.int64)
         for index, (time, pose) in enumerate(zip(self.frame_times.tolist(), poses, strict=True)):
-            images = {}
+            images, exposed = {}, []
             for camera in self.rig or ():
                 found = _within(times[camera.name], time, CAMERA_TOLERANCE_NS)
                 if found is not None:
                     images[camera.name] = self.images[camera.name][found]
+                    exposed.append(found)
+            motion = invert(pose) @ self.pose_at(np.array(exposed)) if exposed else ()
             sweep = _within(sweep_times, time, CUBOID_TOLERANCE_NS)
             yield Frame(
                 index=index,
@@ -181,6 +184,7 @@ class Av2Log:
                 images=images,
                 lidar=None if sweep is None else self.sweeps[sweep],
                 occluders=occluders_of(self.cuboids(time)),
+                ego_SE3_exposure=dict(zip(images, motion, strict=True)),
             )
 
     def _frame_times(self, rate_hz: float | None) -> Times:

@@ -12,20 +12,31 @@ from pathlib import Path
 from rtmap_cli.errors import BadInput
 from rtmap_cli.logs.log import Log
 
-READERS = {"av2": ("rtmap_cli.formats.av2", "Av2Log")}
-"""Prefix of a log argument → module and class of its reader."""
+READERS = {
+    "av2": ("rtmap_cli.formats.av2", "Av2Log"),
+    "nuscenes": ("rtmap_cli.formats.nuscenes", "open_nuscenes"),
+    "dgp": ("rtmap_cli.formats.dgp", "DgpLog"),
+}
+"""Prefix of a log argument → module and class (or function) of its reader."""
 
 MARKS = {
+    # First: among the tables of nuScenes there is a log.json too.
+    "nuscenes": ("v1.0-*/sample_data.json", "sample_data.json"),
     "native": ("log.json", "frames.parquet"),
     "av2": ("city_SE3_egovehicle.feather", "annotations.feather", "annotations_with_ego.feather"),
+    "dgp": ("scene_dataset*.json", "scene_*.json"),
 }
 """Files that tell a format, so that a log which lacks one of them is still named as what it is."""
+
+OF_MANY = frozenset({"nuscenes", "dgp"})
+"""Formats whose folders hold many drives: ``DIR#SCENE`` names one."""
 
 
 def log_format(spec: str | Path) -> tuple[str, Path]:
     """(``native`` or a key of READERS, folder) of a log argument.
 
-    ``av2:DIR`` forces the Argoverse 2 reader; without a prefix the folder tells what it is.
+    ``av2:DIR``, ``nuscenes:DIR#SCENE`` or ``dgp:DIR#SCENE`` force a reader; without a prefix the
+    folder (or an info file ``.pkl`` of nuScenes) tells what it is. ``#SCENE`` stays in the path.
     BadInput when there is no such folder or it is no log of a known format.
     """
     text = str(spec)
@@ -33,13 +44,20 @@ def log_format(spec: str | Path) -> tuple[str, Path]:
     if rest and prefix in READERS:
         return prefix, Path(rest)
     folder = Path(text)
+    scene = ""
+    if not folder.exists() and "#" in text:
+        folder, scene = Path(text.rpartition("#")[0]), text.rpartition("#")[2]
     if not folder.exists():
         raise BadInput(folder, "no such log folder")
+    if folder.is_file() and folder.suffix == ".pkl":
+        return "nuscenes", folder
     if not folder.is_dir():
         raise BadInput(folder, "is a file, a log is a folder")
     for kind, marks in MARKS.items():
-        if any((folder / mark).exists() for mark in marks):
-            return kind, folder
+        if any(next(folder.glob(mark), None) for mark in marks):
+            if scene and kind not in OF_MANY:
+                raise BadInput(text, f"a {kind} log has no scenes", f"give {folder}")
+            return kind, Path(text)
     what = "is an empty folder" if not any(folder.iterdir()) else "is not a log"
     raise BadInput(
         folder,
@@ -49,7 +67,7 @@ def log_format(spec: str | Path) -> tuple[str, Path]:
 
 
 def open_log(spec: str | Path) -> Log:
-    """The reader of a log folder (``av2:DIR`` forces Argoverse 2), opened."""
+    """The reader of a log argument (see ``log_format``), opened."""
     kind, folder = log_format(spec)
     if kind == "native":
         from rtmap_cli.logs.native import NativeLog
@@ -58,3 +76,8 @@ def open_log(spec: str | Path) -> Log:
     module, name = READERS[kind]
     log: Log = getattr(importlib.import_module(module), name)(folder)
     return log
+
+
+def notes_of(log: Log) -> list[str]:
+    """What a log lacks or assumes, one sentence each (native logs say it in their files)."""
+    return list(getattr(log, "notes", ()))

@@ -1,5 +1,15 @@
-"""Maps as pictures: panels side by side, north up, one scale."""
+"""Pictures: maps side by side, north up; the cameras of a frame with lines on the road."""
 
+from rtmap_cli.steps.picture.grid import GroundLine, View, draw_views, element_lines, grid_lines
 from rtmap_cli.steps.picture.panels import Mark, Panel, draw_panels
 
-__all__ = ["Mark", "Panel", "draw_panels"]
+__all__ = [
+    "GroundLine",
+    "Mark",
+    "Panel",
+    "View",
+    "draw_panels",
+    "draw_views",
+    "element_lines",
+    "grid_lines",
+]
