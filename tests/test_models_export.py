@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ pytest.importorskip("onnxscript", reason="onnxscript is not installed (extra: tr
 
 import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
+from rtmap_models import export  # noqa: E402
 from rtmap_models.checkpoint import load_network, save_checkpoint  # noqa: E402
 from rtmap_models.config import CONFIGS, load_config  # noqa: E402
 from rtmap_models.export import read_configuration, read_weights  # noqa: E402
@@ -65,7 +66,25 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def exported(weights: Path) -> dict[str, Any]:
+def traced_once() -> Iterator[None]:
+    """Tracing takes most of an export; the same weights are traced once for all tests."""
+    made: list[onnx.ModelProto] = []
+    trace = export._trace
+
+    def traced(network: Any) -> onnx.ModelProto:
+        if not made:
+            made.append(trace(network))
+        copy = onnx.ModelProto()
+        copy.CopyFrom(made[0])
+        return copy
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export, "_trace", traced)
+        yield
+
+
+@pytest.fixture(scope="module")
+def exported(weights: Path, traced_once: None) -> dict[str, Any]:
     """The model and its report, from the command line."""
     return _export(weights, "model.onnx")
 
@@ -178,7 +197,11 @@ def test_places_stay_single_precision(weights: Path, exported: dict[str, Any]) -
 
 
 def test_a_miss_writes_nothing_and_exits_1(
-    rtmap: Callable[..., Any], weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rtmap: Callable[..., Any],
+    weights: Path,
+    tmp_path: Path,
+    traced_once: None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """onnxruntime is made to answer a little beside: as a faulty provider would."""
     run = onnxruntime.InferenceSession.run
