@@ -163,7 +163,7 @@ def run_workers(count: int, work: Callable[..., Any], arguments: Sequence[Any]) 
             with passed_on([p.pid for p in context.processes]):
                 while not context.join():
                     pass
-        except mp.ProcessExitedException:
+        except (mp.ProcessExitedException, mp.ProcessRaisedException):
             _raise_noted(folder)
             raise
         result = folder / "result.json"
