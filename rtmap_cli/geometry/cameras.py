@@ -54,3 +54,33 @@ def fit_camera(
     shift = horizon * height - horizon_row(fitted, ego_SE3_camera)
     warp[1, 2] += shift
     return warp, warp @ intrinsics
+
+
+PLANE_REACH_M = 15.0
+"""A point of the road this far from the vehicle counts half."""
+
+
+def fit_plane(points: Array) -> Array:
+    """(3,) a, b, c of the road z = a x + b y + c through (n, 3) points of it in the ego frame,
+    metres, the nearer the heavier; least squares.
+
+    Level where there are fewer than eight points or they hardly span a plane.
+    """
+    rows = np.column_stack([points[:, :2], np.ones(len(points))])
+    weight = 1.0 / (1.0 + (np.hypot(points[:, 0], points[:, 1]) / PLANE_REACH_M) ** 2)
+    rows, z = rows * weight[:, None], points[:, 2] * weight
+    if len(points) < 8 or np.linalg.svd(rows, compute_uv=False)[-1] < 1.0:
+        return np.zeros(3)
+    return np.asarray(np.linalg.lstsq(rows, z, rcond=None)[0], dtype=np.float64)
+
+
+def levelled(ego_to_image: NDArray[np.floating], plane: Array) -> Array:
+    """Projections (..., 3, 4) in which the road z = a x + b y + c, ``plane`` (3,), is z = 0.
+
+    With e_k the columns, a point of the road is seen at e_0 x + e_1 y + e_2 (a x + b y + c) + e_3.
+    """
+    out: Array = np.array(ego_to_image, dtype=np.float64)
+    up = out[..., 2]
+    for column, slope in zip((0, 1, 3), plane, strict=True):
+        out[..., column] += slope * up
+    return out
