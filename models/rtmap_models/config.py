@@ -75,6 +75,8 @@ class TinyConfig(ModelConfig):
     widths: tuple[int, int, int, int]
     fine_width: int
     coarse_width: int
+    side_width: int
+    field_width: int
     query_width: int
     point_width: int
     heads: int
@@ -97,6 +99,7 @@ class PaperConfig(ModelConfig):
     encoder: str  # "camera" or "raster"
     raster_channels: int  # of the raster encoder's input
     backbone: str  # "resnet18" or "resnet50"
+    backbone_width: int  # of its stem; 64 for torchvision's weights
     backbone_norm: str  # "batch" (from scratch) or "frozen" (with weights that the user brings)
     image_stride: int  # pixels per cell of the image features that are lifted: 8, 16 or 32
     image_width: int  # channels of the image features
@@ -151,7 +154,14 @@ class PaperConfig(ModelConfig):
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
                 return f"{name} must be one of {', '.join(allowed)}"
-        for name in ("raster_channels", "image_width", "width", "heads", "layers", "feedforward"):
+        for name in (
+            "raster_channels",
+            "backbone_width",
+            "image_width",
+            "width",
+            "heads",
+            "layers",
+        ):
             if getattr(self, name) < 1:
                 return f"{name} must be at least 1"
         if self.width % self.heads or not self.heights_m or self.deform_points < 1:

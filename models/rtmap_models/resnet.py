@@ -91,17 +91,20 @@ def _shortcut(inputs: int, outputs: int, stride: int, norm: Norm) -> nn.Sequenti
 
 
 class ResNet(nn.Module):
-    """Normalised images → the maps of the last three stages."""
+    """Normalised images → the maps of the last three stages.
 
-    def __init__(self, kind: str, norm: str = "batch"):
+    ``base`` is the width of the stem; torchvision's is 64, others cannot take its weights.
+    """
+
+    def __init__(self, kind: str, norm: str = "batch", base: int = 64):
         super().__init__()
         block: type[BasicBlock | Bottleneck] = BasicBlock if kind == "resnet18" else Bottleneck
         make: Norm = FrozenNorm if norm == "frozen" else nn.BatchNorm2d
-        self.conv1 = nn.Conv2d(3, 64, 7, 2, 3, bias=False)
-        self.bn1 = make(64)
-        inputs = 64
+        self.conv1 = nn.Conv2d(3, base, 7, 2, 3, bias=False)
+        self.bn1 = make(base)
+        inputs = base
         for stage, count in enumerate(BLOCKS[kind]):
-            width = 64 * 2**stage
+            width = base * 2**stage
             blocks = []
             for k in range(count):
                 stride = 2 if stage > 0 and k == 0 else 1

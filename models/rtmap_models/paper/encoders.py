@@ -22,7 +22,7 @@ from rtmap_models.resnet import ResNet, normalize_images
 
 class Encoded(NamedTuple):
     """``bev`` (B, width, rows, columns); ``image_classes`` (B, N, C, H / stride, W / stride)
-    logits of what the images show, where an encoder reads images (an auxiliary task, training only)."""
+    logits of what the images show, where an encoder reads images (training only)."""
 
     bev: Tensor
     image_classes: Tensor | None
@@ -51,7 +51,7 @@ class CameraEncoder(nn.Module):
     def __init__(self, config: PaperConfig):
         super().__init__()
         width = config.image_width
-        self.backbone = ResNet(config.backbone, config.backbone_norm)
+        self.backbone = ResNet(config.backbone, config.backbone_norm, config.backbone_width)
         inputs = self.backbone.widths[-config.stages :]
         self.sides = nn.ModuleList(nn.Conv2d(n, width, 1) for n in inputs)
         self.mix = conv_block(width, width)
