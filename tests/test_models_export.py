@@ -16,10 +16,11 @@ pytest.importorskip("onnxscript", reason="onnxscript is not installed (extra: tr
 import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
 from rtmap_models import export  # noqa: E402
+from rtmap_models.architecture import build_network  # noqa: E402
 from rtmap_models.checkpoint import load_network, save_checkpoint  # noqa: E402
 from rtmap_models.config import CONFIGS, load_config  # noqa: E402
 from rtmap_models.export import read_configuration, read_weights  # noqa: E402
-from rtmap_models.network import RTMapNet  # noqa: E402
+from rtmap_models.gathers import spell_out_grid_samples  # noqa: E402
 
 from rtmap_cli.errors import BadInput  # noqa: E402
 from rtmap_cli.steps.infer import find_model  # noqa: E402
@@ -50,7 +51,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "small.toml").write_text(text)
     config = load_config(folder / "small.toml")
     torch.manual_seed(0)
-    network = RTMapNet(config)
+    network = build_network(config)
     with torch.no_grad():
         for name, tensor in network.state_dict().items():
             if name.endswith("num_batches_tracked"):
@@ -194,6 +195,42 @@ def test_places_stay_single_precision(weights: Path, exported: dict[str, Any]) -
     assert not ran & {"GridSample", "TopK", "Div", "Sqrt", "Reciprocal", "Exp", "ScatterND"}
     weights32 = {i.name for i in model.graph.initializer if i.data_type == onnx.TensorProto.FLOAT}
     assert "propose.shape.weight" in weights32 and "decoder.layers.0.move.weight.T" in weights32
+
+
+def test_maps_are_read_row_by_row(exported: dict[str, Any]) -> None:
+    """Only the three colours of the images are left to GridSample; the maps' channels are not."""
+    model = onnx.load(exported["path"])
+    kinds = [n.op_type for n in model.graph.node]
+    assert kinds.count("GridSample") == 1
+    assert spell_out_grid_samples(model) == 0
+
+
+@pytest.mark.parametrize("channels", [8, 20])
+def test_spelled_out_sampling_equals_the_operator(channels: int) -> None:
+    """At any batch, inside, on the rim and far outside."""
+    helper, f32 = onnx.helper, onnx.TensorProto.FLOAT
+    node = helper.make_node("GridSample", ["x", "g"], ["y"], padding_mode="border")
+    shapes = {
+        "x": ["B", channels, "H", "W"],
+        "g": ["B", "h", "w", 2],
+        "y": ["B", channels, "h", "w"],
+    }
+    x, g, y = (helper.make_tensor_value_info(n, f32, s) for n, s in shapes.items())
+    graph = helper.make_graph([node], "sampling", [x, g], [y], value_info=[x])
+    opset = [helper.make_opsetid("", 20)]
+    native, spelled = (helper.make_model(graph, opset_imports=opset, ir_version=9) for _ in "ab")
+    assert spell_out_grid_samples(spelled) == 1
+    onnx.checker.check_model(spelled, full_check=True)
+    rng = np.random.default_rng(0)
+    for batch, height, width in ((1, 5, 7), (3, 1, 4)):
+        grid = rng.uniform(-1.5, 1.5, (batch, 6, 9, 2)).astype(np.float32)
+        grid[:, 0, :4] = [[-1, -1], [1, 1], [1, -1], [0, 0]]
+        maps = rng.normal(size=(batch, channels, height, width)).astype(np.float32)
+        a, b = (
+            onnxruntime.InferenceSession(m.SerializeToString()).run(None, {"x": maps, "g": grid})[0]
+            for m in (native, spelled)
+        )
+        np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 def test_a_miss_writes_nothing_and_exits_1(

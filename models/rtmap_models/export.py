@@ -17,6 +17,7 @@ from torch import nn
 from rtmap_cli.errors import Findings
 from rtmap_cli.tables import whole_file
 from rtmap_models.example import example_inputs
+from rtmap_models.gathers import spell_out_grid_samples
 from rtmap_models.half import to_half
 from rtmap_models.onnx_weights import CONFIG_KEY, keep_weights, read_configuration, read_weights
 from rtmap_models.parity import (
@@ -70,6 +71,7 @@ def export_onnx(
     if half:
         to_half(model)
     else:
+        spell_out_grid_samples(model)
         keep_weights(model, network.state_dict())
     _describe(model, network, metadata)
     with whole_file(path) as temporary:

@@ -61,6 +61,8 @@ def fold_batch_norms(model: onnx.ModelProto) -> None:
         conv = producer.get(node.input[0]) if node.op_type == "BatchNormalization" else None
         if conv is None or conv.op_type != "Conv" or len(uses[node.input[0]]) != 1:
             continue
+        if not weights.keys() >= {conv.input[1], *node.input[1:5]}:
+            continue
         scale, shift, mean, variance = (numpy_helper.to_array(weights[n]) for n in node.input[1:5])
         epsilon = next((a.f for a in node.attribute if a.name == "epsilon"), 1e-5)
         factor = scale.astype(np.float64) / np.sqrt(variance.astype(np.float64) + epsilon)

@@ -1,0 +1,191 @@
+"""How long a frame takes: onnxruntime against torch, and the whole of ``rtmap infer``.
+
+    python benchmarks/latency.py                       the shipped model, a simulated log
+    python benchmarks/latency.py --model m.onnx --log logs/monday --map map
+
+Needs the extras ``train`` and ``simulate``. Both sides take turns within one run, so that a busy
+machine slows both; figures are medians, the ratio is the median of the ratios of neighbours.
+Prints one JSON object; ``infer`` is a new process with everything: start, imports, reading and
+decoding the JPEGs, the network, writing the run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import torch
+from rtmap_models.architecture import build_network
+from rtmap_models.config import config_from_dict, load_config
+from rtmap_models.example import example_inputs
+from rtmap_models.export import INPUTS, read_configuration, read_weights
+from torch import nn
+
+from rtmap_cli.logs.open import open_log
+from rtmap_cli.steps.infer import MapModel
+from rtmap_cli.steps.infer.model import find_model
+
+PRIORS = 20
+"""Prior slots in use: about what a 72 × 36 m crop of a real map holds."""
+
+BARS = {"onnxruntime against torch": 1.5, "infer, frames per second": 10.0}
+
+
+def twin(path: Path, config: str) -> nn.Module:
+    """The torch network of a model file; with fresh weights, which take the same time, if the
+    file does not hold its own."""
+    values = read_configuration(path)
+    settings = config_from_dict(values, path) if values else load_config(config)
+    network = build_network(settings).eval()
+    state = read_weights(path)
+    if state is not None:
+        network.load_state_dict(state)
+    return network
+
+
+def take_turns(sides: dict[str, Callable[[], Any]], runs: int, warm: int = 3) -> dict[str, Any]:
+    """Milliseconds of each side, called in turns: all of them, without the first few."""
+    times: dict[str, list[float]] = {name: [] for name in sides}
+    for _ in range(runs + warm):
+        for name, call in sides.items():
+            start = time.perf_counter()
+            call()
+            times[name].append((time.perf_counter() - start) * 1e3)
+    return {name: np.array(values[warm:]) for name, values in times.items()}
+
+
+def network(path: Path, torch_side: nn.Module, cameras: int, threads: int, runs: int) -> Any:
+    """One frame at a time through onnxruntime and through torch eager, same threads."""
+    model = MapModel(str(path), threads)
+    torch.set_num_threads(threads)
+    inputs = example_inputs(torch_side.config, 1, cameras, PRIORS)
+    feed = [x.numpy() for x in inputs]
+
+    def eager() -> Any:
+        with torch.inference_mode():
+            return torch_side(*inputs)
+
+    ms = take_turns({"onnxruntime": lambda: model(*feed), "torch": eager}, runs)
+    return {
+        **{f"{name} ms": float(np.median(values)) for name, values in ms.items()},
+        **{f"{name} 90 % ms": float(np.quantile(values, 0.9)) for name, values in ms.items()},
+        "ratio": float(np.median(ms["torch"] / ms["onnxruntime"])),
+    }
+
+
+def operators(path: Path, config: Any, cameras: int, runs: int = 10, most: int = 8) -> Any:
+    """Shares of onnxruntime's time by operator, from its own profiler, one thread."""
+    inputs = example_inputs(config, 1, cameras, PRIORS)
+    feed = dict(zip(INPUTS, [x.numpy() for x in inputs], strict=True))
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = 1, 4
+    options.enable_profiling = True
+    with tempfile.TemporaryDirectory() as folder:
+        options.profile_file_prefix = str(Path(folder) / "profile")
+        session = onnxruntime.InferenceSession(str(path), options, ["CPUExecutionProvider"])
+        for _ in range(runs):
+            session.run(None, feed)
+        events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
+    spent: Counter[str] = Counter()
+    for event in events:
+        if event.get("cat") == "Node" and event["name"].endswith("kernel_time"):
+            spent[event["args"]["op_name"]] += event["dur"]
+    return {name: us / spent.total() for name, us in spent.most_common(most)}
+
+
+def simulate(folder: Path, frames: int) -> tuple[Path, Path]:
+    """A drive through a simulated town with the default rig: its log and its map."""
+    town, log = folder / "town", folder / "log"
+    _rtmap("simulate", "town", "--seed", 5, "-o", town)
+    more = ("--route", "turning", "--frames", frames, "--seed", 5)
+    _rtmap("simulate", "images", "--map", town, "-o", log, *more)
+    return log, town
+
+
+def infer(path: Path, log: Path, vector_map: Path, threads: int, runs: int) -> dict[str, Any]:
+    """Frames per second of ``rtmap infer``: of the whole process, and as the command says it
+    (without start and imports)."""
+    whole, said, frames = [], [], 0
+    with tempfile.TemporaryDirectory() as folder:
+        for _ in range(runs):
+            start = time.perf_counter()
+            call = ("--model", path, "--map", vector_map, "-o", Path(folder) / "run", "--overwrite")
+            out = _rtmap("infer", log, *call, "--threads", threads, "-q")
+            frames = out["frames"]
+            whole.append(frames / (time.perf_counter() - start))
+            said.append(out["frames_per_second"])
+    return {
+        "frames": frames,
+        "frames per second": float(np.median(said)),
+        "frames per second, whole process": float(np.median(whole)),
+    }
+
+
+def reading(path: Path, log_path: Path) -> dict[str, float]:
+    """Milliseconds per frame to read, decode and fit the images, one thread."""
+    from rtmap_cli.steps.infer.images import FittedCamera
+
+    log, info = open_log(str(log_path)), MapModel(str(path), 1).info
+    if log.rig is None:
+        raise SystemExit(f"{log_path}: the log has no calibration")
+    cameras = {
+        c.name: FittedCamera(c, info.image_size, info.horizon, log.ground_z) for c in log.rig
+    }
+    times = []
+    for frame in log.frames():
+        start = time.perf_counter()
+        for name, image in frame.images.items():
+            cameras[name].load(image)
+        times.append((time.perf_counter() - start) * 1e3)
+    return {"cameras": len(cameras), "median ms": float(np.median(times))}
+
+
+def _rtmap(*words: object) -> Any:
+    call = [sys.executable, "-m", "rtmap_cli", *map(str, words), "--json"]
+    done = subprocess.run(call, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(done.stderr or done.stdout)
+    return json.loads(done.stdout)
+
+
+def main() -> None:
+    """Measure and print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--model", default="rtmap-tiny", help="zoo name or .onnx file")
+    parser.add_argument("--config", default="rtmap-tiny", help="where the file states none")
+    parser.add_argument("--log", type=Path, help="default: one is simulated")
+    parser.add_argument("--map", type=Path, help="the prior map, with --log")
+    parser.add_argument("--frames", type=int, default=32, help="of the simulated log")
+    parser.add_argument("--runs", type=int, default=30)
+    parser.add_argument("--infer-runs", type=int, default=5)
+    a = parser.parse_args()
+    if (a.log is None) != (a.map is None):
+        parser.error("--log and --map go together")
+    path = find_model(a.model)
+    side = twin(path, a.config)
+    report: dict[str, Any] = {"model": str(path), "network": {}}
+    for cameras in (6, 7):
+        for threads in (1, 2):
+            key = f"{cameras} cameras, {threads} threads"
+            report["network"][key] = network(path, side, cameras, threads, a.runs)
+    report["operators"] = operators(path, side.config, 7)
+    with tempfile.TemporaryDirectory() as folder:
+        log, vector_map = (a.log, a.map) if a.log else simulate(Path(folder), a.frames)
+        report["reading images"] = reading(path, log)
+        report["infer, 2 threads"] = infer(path, log, vector_map, 2, a.infer_runs)
+    report["bars"] = BARS
+    print(json.dumps(report, indent=1, ensure_ascii=False))
+
+
+if __name__ == "__main__":
+    main()
