@@ -94,7 +94,8 @@ def _trace(network: nn.Module) -> onnx.ModelProto:
         "prior_class": {0: batch, 1: priors},
         "prior_mask": {0: batch, 1: priors},
     }
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, we do not
+    for name in ("torch.onnx", "onnxscript"):  # what they miss or skip is no news for a user
+        logging.getLogger(name).setLevel(logging.ERROR)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
