@@ -136,6 +136,30 @@ def test_numbers_that_are_none_are_usage_errors(rtmap: Call, town: Path, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
+def test_what_runs_say_alone_is_replaced_only_when_told(rtmap: Call, town: Path, run: Path) -> None:
+    command = ("detect-changes", run, "--map", town, "-o", town.parent / "c.geojson")
+    rtmap(*command, "--write-runs")
+    (run / "changes.parquet").write_bytes(b"precious")
+    (town.parent / "c.geojson").unlink()
+    told = _one_line(rtmap(*command, "--write-runs", code=3))
+    assert "changes.parquet" in told and "--overwrite" in told
+    assert (run / "changes.parquet").read_bytes() == b"precious"
+    assert not (town.parent / "c.geojson").exists()
+    rtmap(*command, "--write-runs", "--overwrite")
+    assert (run / "changes.parquet").read_bytes() != b"precious"
+
+
+def test_drives_that_are_not_there_are_named(rtmap: Call, town: Path, run: Path) -> None:
+    command = ("evaluate", "map", run, "--truth", town)
+    assert "no traversal 07" in _one_line(
+        rtmap(*command, "--poses", run, "--traversal", "07", code=3)
+    )
+    rtmap(*command, "--poses", run, "--traversal", "a")
+    assert "--poses" in _one_line(rtmap(*command, "--traversal", "07", code=2))
+    poses = ("evaluate", "poses", run, "--truth", run)
+    assert "it has a" in _one_line(rtmap(*poses, "--traversal", "07", code=3))
+
+
 def test_what_nobody_thought_of_is_still_one_line(
     rtmap: Call, monkeypatch: pytest.MonkeyPatch, town: Path
 ) -> None:

@@ -71,6 +71,10 @@ def command(
         raise BadInput(output, "exists already", "choose another output or pass --overwrite")
     if not stream:
         refuse_inside(output, map_path)
+    tables = [path / "changes.parquet" for path in runs] if write_runs else []
+    for table in tables:
+        if table.exists() and not overwrite:
+            raise BadInput(table, "exists already", "pass --overwrite or leave out --write-runs")
     prior = read_map(map_path, map_version)
     traversals, _ = read_traversals(runs, prior.crs)
     classes = classes_of(runs)
@@ -88,10 +92,10 @@ def command(
     }
     write_changes(found, prior.crs, output, info)
     if write_runs:
-        for path, traversal in zip(runs, traversals, strict=True):
+        for table, traversal in zip(tables, traversals, strict=True):
             own = gather_evidence([traversal], prior, classes)
             alone = change_events(own, min_probability, displaced)
-            write_change_table(alone, path / "changes.parquet", prior.crs)
+            write_change_table(alone, table, prior.crs)
     kilometres = sum(t.kilometres for t in traversals)
     counts = {k: sum(c.kind == k for c in found) for k in ("delete", "insert", "modify")}
     told = ", ".join(f"{n} {kind}" for kind, n in counts.items())

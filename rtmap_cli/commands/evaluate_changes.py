@@ -50,12 +50,15 @@ def command(
     Example:
       rtmap evaluate changes changes.geojson --truth town/changes.json --km 1.2
     """
+    from rtmap_cli.errors import UsageError
     from rtmap_cli.output import emit
     from rtmap_cli.steps.evaluate.drives import read_drives
     from rtmap_cli.steps.evaluate.judge import judge_changes, judge_scenes
     from rtmap_cli.steps.evaluate.limits import check_limits, check_names, parse_limits
     from rtmap_cli.tables import read_json
 
+    if traversal is not None and poses is None:
+        raise UsageError("--traversal names a drive of --poses: pass both")
     limits = parse_limits(fail_under)
     check_names(limits, ("precision", "recall", "f1", "acc_changed", "acc_unchanged", "macc"))
     if not changes.is_dir() and "scenes" in (read_json(changes) or ()):

@@ -76,11 +76,14 @@ def command(
     Example:
       rtmap evaluate map runs/drive-00 --truth town --poses logs/drive-00
     """
+    from rtmap_cli.errors import UsageError
     from rtmap_cli.output import emit, log
     from rtmap_cli.steps.evaluate.compare import Settings, compare, missing_frames, read_side
     from rtmap_cli.steps.evaluate.drives import read_drives
     from rtmap_cli.steps.evaluate.limits import check_limits, check_names, parse_limits
 
+    if traversal is not None and poses is None:
+        raise UsageError("--traversal names a drive of --poses: pass both")
     limits = parse_limits(fail_under)
     drives = read_drives(poses, traversal) if poses else []
     settings = Settings(

@@ -29,11 +29,14 @@ def command(run: Path, truth: str, traversal: str | None, initial: bool, as_json
     Example:
       rtmap evaluate poses runs/drive-00 --truth logs/drive-00
     """
+    from rtmap_cli.errors import UsageError
     from rtmap_cli.logs.run import read_run
     from rtmap_cli.output import emit
     from rtmap_cli.steps.evaluate.judge import judge_pairs, judge_poses
 
     if run.name.endswith((".json", ".json.gz")):
+        if traversal is not None:
+            raise UsageError("--traversal names a drive of --truth, pose pairs have none")
         cases = judge_pairs(run, truth)
         emit(
             {"cases": cases}, as_json, [line for n, c in cases.items() for line in [n, *_lines(c)]]

@@ -66,8 +66,9 @@ def command(
     """Read LOG with the network and write a run: what every frame sees, how sure, and which
     elements of the prior map it confirms.
 
-    LOG is a native log folder (docs/log-format.md) or an Argoverse 2 log with images. Without
-    --map it is a first traversal: everything is new.
+    LOG is a native log folder (docs/log-format.md), an Argoverse 2 or TbV log, a scene of nuScenes
+    or DGP (DIR#SCENE), or a nuScenes info file (.pkl). Without --map it is a first traversal:
+    everything is new.
 
     \b
     Example:
@@ -76,7 +77,7 @@ def command(
     import os
     import time
 
-    from rtmap_cli.logs.open import open_log
+    from rtmap_cli.logs.open import notes_of, open_log
     from rtmap_cli.logs.run import STATES, write_run
     from rtmap_cli.maps.crs import check_same_crs
     from rtmap_cli.maps.store import read_map
@@ -85,6 +86,8 @@ def command(
     from rtmap_cli.tables import whole_folder
 
     source = open_log(log_path)
+    for note in notes_of(source):
+        log(f"{source.log_id}: {note}")
     prior = read_map(map_path, map_version) if map_path is not None else None
     if prior is not None:
         check_same_crs(prior.crs, source.crs, str(map_path))

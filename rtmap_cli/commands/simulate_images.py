@@ -125,6 +125,7 @@ def command(
     Example:
       rtmap simulate images --map map --log av2:LOG_DIR --seed 1 -o log
     """  # fmt: skip
+    from rtmap_cli.logs.open import folder_of
     from rtmap_cli.maps.store import read_map
     from rtmap_cli.steps.simulate.driving.drive import first_frames
     from rtmap_cli.steps.simulate.driving.drive_source import TOWN, Route, find_source
@@ -134,7 +135,8 @@ def command(
 
     wanted = [parse_spec(text) for text in specs]
     in_town = log_path.startswith(TOWN)
-    refuse_over(output, map_path, Path(log_path.partition(":")[2] or log_path))
+    place = Path(log_path.partition(":")[2] or log_path) if in_town else folder_of(log_path)
+    refuse_over(output, map_path, place)
     vector_map = read_map(map_path, map_version)
     key = DriveKey(world_seed, seed, drive)
     way = Route(route, length, spacing or TOWN_SPACING)
@@ -175,6 +177,13 @@ def _rig(source: Source, name: str | None, width: int, log_path: str) -> Rig:
     from rtmap_cli.steps.simulate.images.rig import default_rig, scale_camera
 
     if name != "default" and source.rig is not None:
+        for camera in source.rig:
+            if camera.model != "pinhole" or len(camera.distortion) != 3 or any(camera.tangential):
+                raise BadInput(
+                    log_path,
+                    f"{camera.name} has a lens that is not simulated (only k1, k2, k3 are)",
+                    "pass --rig default",
+                )
         return Rig(tuple(scale_camera(c, width) for c in source.rig))
     if name != "default" and source.lanes is None:
         raise BadInput(log_path, "has no calibration", "pass --rig default for a default rig")

@@ -66,6 +66,14 @@ def log_format(spec: str | Path) -> tuple[str, Path]:
     )
 
 
+def folder_of(spec: str | Path) -> Path:
+    """The folder (or info file) of a log argument, without prefix and scene."""
+    text = str(spec)
+    prefix, _, rest = text.partition(":")
+    path = Path(rest if rest and prefix in READERS else text)
+    return path if path.exists() or "#" not in str(path) else Path(str(path).rpartition("#")[0])
+
+
 def open_log(spec: str | Path) -> Log:
     """The reader of a log argument (see ``log_format``), opened."""
     kind, folder = log_format(spec)

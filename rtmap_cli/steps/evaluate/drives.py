@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.poses import interpolate
+from rtmap_cli.logs.open import READERS
 from rtmap_cli.logs.run import Poses, read_poses, read_run_info
 
 Array = NDArray[np.float64]
@@ -61,17 +62,23 @@ def read_drives(spec: str | Path, traversal: str | None = None) -> list[Drive]:
     """The drives of POSES, several only for fleet poses (``traversal`` picks one of them).
 
     A folder with ``truth/poses.parquet`` (a simulated log) gives its true poses, a run its
-    localized ones, an Argoverse 2 log (``av2:DIR`` or its folder) the vehicle's own.
+    localized ones, an Argoverse 2 log or a scene of another format (``av2:DIR``,
+    ``nuscenes:DIR#SCENE``) the vehicle's own. BadInput when there is no drive ``traversal``.
     """
     path = Path(spec)
     if str(spec).startswith("av2:") or (path / "city_SE3_egovehicle.feather").exists():
         drives = [_av2(spec)]
+    elif str(spec).partition(":")[0] in READERS:
+        drives = [_frames_of(spec)]
     elif path.is_dir():
         drives = [_folder(path)]
     elif path.name.endswith((".json", ".json.gz")):
         drives = _fleet(path, traversal)
     else:
         drives = [_drive(read_poses(path), _crs_of(path), path.stem)]
+    if traversal is not None and traversal not in [d.name for d in drives]:
+        names = ", ".join(d.name for d in drives)
+        raise BadInput(spec, f"has no traversal {traversal} (it has {names})")
     for drive in drives:
         if not len(drive):
             raise BadInput(spec, f"drive {drive.name} has no poses")
@@ -133,14 +140,23 @@ def _fleet(path: Path, traversal: str | None) -> list[Drive]:
     from rtmap_cli.formats.detections import read_fleet_poses
 
     fleet = read_fleet_poses(path)
-    if traversal is not None and traversal not in fleet.traversals:
-        names = ", ".join(fleet.traversals)
-        raise BadInput(path, f"has no traversal {traversal} (it has {names})")
+    if traversal not in (None, *fleet.traversals):
+        traversal = None  # The caller says which there are.
     return [
         _drive(poses, fleet.crs, name)
         for name, poses in fleet.traversals.items()
         if traversal in (None, name)
     ]
+
+
+def _frames_of(spec: str | Path) -> Drive:
+    """The poses of the frames of a log of another format."""
+    from rtmap_cli.logs.open import open_log
+
+    log = open_log(spec)
+    frames = list(log.frames())
+    times = np.array([f.timestamp_ns for f in frames], np.int64)
+    return Drive(log.log_id, log.crs, times, np.stack([f.map_SE3_ego for f in frames]))
 
 
 def _av2(spec: str | Path) -> Drive:

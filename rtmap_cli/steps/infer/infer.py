@@ -12,6 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput, NoAnswer
+from rtmap_cli.geometry.cameras import levelled
 from rtmap_cli.geometry.poses import se3_from_xyyaw, xyyaw_of, yaw_of
 from rtmap_cli.logs.log import Frame, Log
 from rtmap_cli.logs.run import (
@@ -28,6 +29,7 @@ from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.prior import PriorSlots, on_prior, prior_slots
 from rtmap_cli.steps.infer.images import FittedCamera
+from rtmap_cli.steps.infer.levelling import RoadUnder
 from rtmap_cli.steps.infer.model import MapModel
 
 Array = NDArray[np.float64]
@@ -39,7 +41,8 @@ class InferOptions:
     """``score_threshold``: new elements below it are dropped; ``existence_threshold``: prior
     elements below it are outdated; ``batch``: frames per call; ``threads``: decoding threads;
     ``skip_bad_frames``: leave out frames that cannot be read and count them;
-    ``max_frames``: stop after so many; ``every``: take every n-th frame."""
+    ``max_frames``: stop after so many; ``every``: take every n-th frame; ``level``: turn the
+    cameras to how the road lies (`RoadUnder`)."""
 
     score_threshold: float = 0.05
     existence_threshold: float = 0.5
@@ -48,6 +51,7 @@ class InferOptions:
     skip_bad_frames: bool = False
     max_frames: int | None = None
     every: int = 1
+    level: bool = True
 
 
 @dataclass(frozen=True)
@@ -80,12 +84,15 @@ def infer_log(
         camera.name: FittedCamera(camera, model.info.image_size, model.info.horizon, log.ground_z)
         for camera in log.rig
     }
+    road = RoadUnder([f.map_SE3_ego for f in log.frames()], prior) if options.level else None
     rows: list[tuple[Frame, int, Array, Array]] = []
     parts: list[Observations] = []
     skipped = dropped = 0
     stream = _chosen(log, options)
     with ThreadPoolExecutor(options.threads) as pool:
-        for batch in _batches(progress(_load_all(stream, cameras, pool, options)), options.batch):
+        for batch in _batches(
+            progress(_load_all(stream, cameras, road, pool, options)), options.batch
+        ):
             good = []
             for item in batch:
                 if isinstance(item, BadInput):
@@ -105,7 +112,11 @@ def infer_log(
     if not rows:
         raise NoAnswer(f"{log.path}: no frame could be read")
     if dropped:
-        say(f"{dropped} prior elements found no slot (the model has {model.info.prior_slots})")
+        say(
+            f"{dropped} prior elements found no slot (the model has {model.info.prior_slots}): in "
+            "each frame the nearest were asked about"
+        )
+    _say_missing(cameras, rows, say)
     info = run_info(
         log.log_id,
         log.crs,
@@ -118,11 +129,24 @@ def infer_log(
         options=asdict(options),
         frames=len(rows),
         skipped_frames=skipped,
+        prior_elements_without_slot=dropped,
         map_version=prior.version if prior is not None else None,
         **(made_by or {}),
     )  # fmt: skip
     observations = Observations.concatenate(parts)
     return Run(info, _frames(rows), observations, _occluders(rows))
+
+
+def _say_missing(
+    cameras: dict[str, FittedCamera],
+    rows: list[tuple[Frame, int, Array, Array]],
+    say: Callable[[str], None],
+) -> None:
+    """Warn of cameras that some frames lack: what only they see is not seen there."""
+    for name in cameras:
+        lacking = sum(name not in row[0].images for row in rows)
+        if lacking:
+            say(f"{lacking} of {len(rows)} frames have no image of {name}")
 
 
 def _chosen(log: Log, options: InferOptions) -> Iterator[Frame]:
@@ -136,20 +160,23 @@ def _chosen(log: Log, options: InferOptions) -> Iterator[Frame]:
         yield frame
 
 
-def _load(frame: Frame, cameras: dict[str, FittedCamera]) -> _Loaded:
+def _load(frame: Frame, cameras: dict[str, FittedCamera], road: RoadUnder | None) -> _Loaded:
     names = [name for name in cameras if name in frame.images]
     if not names:
         raise BadInput(
             f"frame {frame.index}", "has no images", "simulate them (rtmap simulate images) or skip"
         )
     images = np.stack([cameras[name].load(frame.images[name]) for name in names])
-    matrices = [cameras[name].at(frame.ego_SE3_exposure.get(name)) for name in names]
-    return _Loaded(frame, images, np.stack(matrices))
+    matrices = np.stack([cameras[name].at(frame.ego_SE3_exposure.get(name)) for name in names])
+    if road is not None:
+        matrices = levelled(matrices, road.plane(frame.map_SE3_ego)).astype(np.float32)
+    return _Loaded(frame, images, matrices)
 
 
 def _load_all(
     frames: Iterator[Frame],
     cameras: dict[str, FittedCamera],
+    road: RoadUnder | None,
     pool: ThreadPoolExecutor,
     options: InferOptions,
 ) -> Iterator[_Loaded | BadInput]:
@@ -158,7 +185,7 @@ def _load_all(
 
     def guarded(frame: Frame) -> _Loaded | BadInput:
         try:
-            return _load(frame, cameras)
+            return _load(frame, cameras, road)
         except BadInput as error:
             if not options.skip_bad_frames:
                 raise
