@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -232,6 +233,7 @@ def test_validation_gives_an_oracle_full_marks(tiny: Path, frames: Path) -> None
 def test_batches_follow_from_seed_process_and_step(tiny: Path, frames: Path) -> None:
     config, recipe = load_config(tiny), Recipe(batch=2)
     feed = Feed([frames], config, recipe, 1, 0)
+    assert len(pickle.dumps(feed)) < 5000  # frames stay on disk
     ahead = feed.batches(5, 1, torch.device("cpu"))
     for step in (5, 6):
         assert torch.equal(next(ahead).picture, feed[step].picture)

@@ -167,6 +167,10 @@ class Frames:
         self.starts = np.zeros(1, np.int64)
         self.refresh()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process opens the files itself instead of getting copies of them."""
+        return Frames, (self.folders, self.config)
+
     @property
     def folder(self) -> Path:
         """The first folder (for messages)."""

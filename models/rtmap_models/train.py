@@ -32,8 +32,8 @@ def train(
         raise UsageError("give --steps or --minutes")
     if len(Frames(options.data, config)) == 0:
         raise BadInput(options.data[0], "no training frames", "make some with --frames")
-    if options.validate is not None and len(Frames(options.validate, config)) == 0:
-        raise BadInput(options.validate, "no frames to validate on", "make some with --frames")
+    if options.validate and len(Frames(options.validate, config)) == 0:
+        raise BadInput(options.validate[0], "no frames to validate on", "make some with --frames")
     if options.resume is not None:
         load_resumable(options.resume, config)
     if group is None:

@@ -32,7 +32,7 @@ class TrainOptions:
     It ends after ``steps`` steps or ``minutes`` minutes, whichever is given; the rate falls
     to zero there. ``stop_after`` steps or ``stop_minutes`` minutes of this call it stops early, to
     be gone on with from the checkpoint ``resume``. ``init`` gives the first weights (see
-    ``checkpoint.start_from``). ``validate`` is a folder of frames that are never trained on: looked
+    ``checkpoint.start_from``). ``validate`` are folders of frames that are never trained on: looked
     at every ``validate_every`` steps (default: ten times in the run), at most ``validate_frames``
     of them; ``keep_best`` writes the best averaged weights so far beside the output.
     """
@@ -48,7 +48,7 @@ class TrainOptions:
     resume: Path | None = None
     init: str | None = None
     init_partial: bool = False
-    validate: Path | None = None
+    validate: tuple[Path, ...] = ()
     validate_every: int | None = None
     validate_frames: int = 64
     keep_best: bool = False

@@ -19,7 +19,6 @@ PASSED_ON = (
     "resume",
     "init",
     "init_partial",
-    "validate",
     "validate_every",
     "validate_frames",
     "keep_best",
@@ -65,7 +64,7 @@ NEEDS = "training needs the extra 'train': pip install 'rtmap[train,simulate]'"
     "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True
 )
 @click.option("--loaders", type=click.IntRange(0), help="Processes that prepare batches.")
-@click.option("--validate", type=options.PATH, help="Folder of frames that are never trained on.")
+@click.option("--validate", help="Frames, a log or logs that are never trained on.")
 @click.option("--validate-every", type=click.IntRange(1), help="In steps (default: ten times).")
 @click.option("--validate-frames", type=click.IntRange(1), default=64, show_default=True)
 @click.option("--keep-best", is_flag=True, help="Keep the best weights as NAME.best.pt.")
@@ -130,17 +129,19 @@ def _run(sizes: Any, config: str, output: Path, given: dict[str, Any], group: An
     device = group.device if group is not None else pick_device(given["device"])
     workers = given["threads"] or cpu_count() or 1
 
-    def make() -> tuple[Path, ...]:
+    def make() -> tuple[tuple[Path, ...], tuple[Path, ...]]:
         return _make_frames(sizes, output, given, workers)
 
-    data = make() if group is None else group.first(make)
+    data, unseen = make() if group is None else group.first(make)
     if given["steps"] is None and given["minutes"] is None:
         return 0
     loaders = given["loaders"]
     if loaders is None:
         loaders = min(8, (cpu_count() or 2) - 1) if device.type == "cuda" else 0
     passed_on = {name: given[name] for name in PASSED_ON}
-    request = TrainOptions(data=data, output=output, recipe=recipe, loaders=loaders, **passed_on)
+    request = TrainOptions(
+        data=data, output=output, recipe=recipe, loaders=loaders, validate=unseen, **passed_on
+    )
     first = group is None or group.rank == 0
     rendering: Any = nullcontext()
     if given["live"] and first:
@@ -157,8 +158,11 @@ def _run(sizes: Any, config: str, output: Path, given: dict[str, Any], group: An
     return 130 if result["signal"] else 0
 
 
-def _make_frames(sizes: Any, output: Path, given: dict[str, Any], workers: int) -> tuple[Path, ...]:
-    """Folders of frames for --data and --frames, rendered and converted where they are missing."""
+def _make_frames(
+    sizes: Any, output: Path, given: dict[str, Any], workers: int
+) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Folders of frames for --data with --frames and for --validate, rendered and converted where
+    they are missing."""
     from rtmap_models.sources import gather, is_frame_folder
 
     from rtmap_cli.output import log
@@ -176,4 +180,11 @@ def _make_frames(sizes: Any, output: Path, given: dict[str, Any], workers: int) 
             count, seed = given["frames"], given["seed"]
             generate(sizes, towns, count, seed, workers, report, keep_images=keep)
     cache = given["cache"] or output.parent / "cache"
-    return gather(data, sizes, cache, given["map_path"], report, workers, keep_images=keep)
+    unseen = [given["validate"]] if given["validate"] is not None else []
+    train, held_out = (
+        gather(part, sizes, cache, given["map_path"], report, workers, keep_images=keep)
+        for part in (data, unseen)
+    )
+    if both := set(train) & set(held_out):
+        raise UsageError(f"{min(both)} is both trained on and validated on")
+    return train, held_out
