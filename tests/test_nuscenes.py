@@ -70,6 +70,15 @@ def test_a_scene_is_a_log(folder: Path) -> None:
         assert all(p.exists() and "samples" in p.parts for p in frame.images.values())
 
 
+def test_poses_are_planar(folder: Path) -> None:
+    """Heights are 0 in nuScenes while roll and pitch follow the road."""
+    a = np.radians(2.0)
+    tilted = [np.cos(a / 2), 0.0, np.sin(a / 2), 0.0]
+    _edit(folder, "ego_pose", lambda records: _set(records, "rotation", tilted))
+    for frame in NuscenesLog(folder, "scene-0001").frames():
+        np.testing.assert_allclose(frame.map_SE3_ego[:3, :3], np.eye(3), atol=1e-9)
+
+
 def test_every_image_has_its_own_pose(folder: Path) -> None:
     log = NuscenesLog(folder, "scene-0001")
     for frame in log.frames():

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.formats.nuscenes_info import CAMERAS, NuscenesInfoLog
+from rtmap_cli.formats.nuscenes_info import CAMERAS, NuscenesInfoLog, flat
 from rtmap_cli.formats.nuscenes_sweep import read_sweep_file
 from rtmap_cli.formats.nuscenes_tables import Record, Tables, location_crs, read_tables
 from rtmap_cli.formats.records import count_of, intrinsics_of, pose_of
@@ -102,7 +102,7 @@ class NuscenesLog(FrameLog):
         return Frame(
             index=index,
             timestamp_ns=self._microseconds(data[lead]) * 1000,
-            map_SE3_ego=here,
+            map_SE3_ego=flat(here),
             sigma=POSE_SIGMA.copy(),
             images=images,
             lidar=self._file(data[LIDAR]) if LIDAR in data else None,

@@ -16,7 +16,7 @@ from rtmap_cli.errors import BadInput
 from rtmap_cli.formats.nuscenes_sweep import read_sweep_file
 from rtmap_cli.formats.pickles import read_plain_pickle
 from rtmap_cli.formats.records import array, intrinsics_of, matrix_of, need
-from rtmap_cli.geometry.poses import invert
+from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, yaw_of
 from rtmap_cli.logs.frames import POSE_SIGMA, FrameLog
 from rtmap_cli.logs.log import Camera, Frame, Rig
 from rtmap_cli.logs.native import paths_inside
@@ -33,6 +33,15 @@ CAMERAS = (
     "CAM_BACK",
 )
 """The six cameras, front to rear: the order in which a network sees them."""
+
+
+def flat(map_SE3_ego: Array) -> Array:
+    """A pose (4, 4) of nuScenes without its tilt.
+
+    nuScenes localizes in the plane: heights are 0 everywhere while roll and pitch follow the road.
+    Together they would tell of a level road under a tilted vehicle, which is wrong.
+    """
+    return se3_from_xyyaw(map_SE3_ego[0, 3], map_SE3_ego[1, 3], yaw_of(map_SE3_ego))
 
 
 class NuscenesInfoLog(FrameLog):
@@ -92,7 +101,7 @@ class NuscenesInfoLog(FrameLog):
         return Frame(
             index=index,
             timestamp_ns=round(seconds * 1e6) * 1000,
-            map_SE3_ego=matrix_of(need(sample, "ego2global", path, what), path, "ego2global"),
+            map_SE3_ego=flat(matrix_of(need(sample, "ego2global", path, what), path, "ego2global")),
             sigma=POSE_SIGMA.copy(),
             images=images,
             lidar=sweep,
