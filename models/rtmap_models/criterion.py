@@ -29,6 +29,7 @@ class LossWeights:
     laplace: float = 0.3
     direction: float = 0.5
     segmentation: float = 3.0
+    field: float = 1.0
     heat: float = 0.5
     proposal: float = 1.0
 
@@ -42,6 +43,7 @@ def compute_losses(prediction: Prediction, batch: Batch, weights: LossWeights) -
             value = getattr(weights, name) * value
             parts[name] = parts[name] + value if name in parts else value
     parts["segmentation"] = weights.segmentation * _segmentation(prediction.segmentation, batch)
+    parts["field"] = weights.field * _field(prediction.field, batch)
     heat, shape = _proposals(prediction.proposals, batch)
     parts["heat"], parts["proposal"] = weights.heat * heat, weights.proposal * shape
     return parts
@@ -114,6 +116,12 @@ def _segmentation(logits: Tensor, batch: Batch) -> Tensor:
     both, either = (p * target).sum(dim=(0, 2, 3)), (p + target).sum(dim=(0, 2, 3))
     dice = (1 - (2 * both + 1) / (either + 1)).mean()
     return plain + dice / 3.0
+
+
+def _field(field: Tensor, batch: Batch) -> Tensor:
+    known = ~batch.field.isnan()
+    error = torch.where(known, field - batch.field, torch.zeros_like(field)).abs()
+    return error.sum() / known.sum().clamp(min=1) * 2
 
 
 def _proposals(dense: DenseProposals, batch: Batch) -> tuple[Tensor, Tensor]:

@@ -20,6 +20,7 @@ from rtmap_models.samples import (
     Scene,
     clip,
     equivalent_orders,
+    field_target,
     heat_target,
     make_prior,
     rotation,
@@ -103,6 +104,7 @@ class Batch:
     truth_new: NDArray[np.bool_]  # (G,) to be found by the new queries
     truth_closed: NDArray[np.bool_]  # (G,)
     segmentation: Tensor  # (B, C, H/2, W/2)
+    field: Tensor  # (B, C, 2, H/2, W/2) metres to the nearest element, NaN where far
     heat: Tensor  # (B, C, h, w)
     cells: Tensor  # (M, 5) sample, class, row, column, truth
     images: Tensor | None = None  # (B, N, H, W, 3) uint8; an absent camera is zero
@@ -290,6 +292,7 @@ def collate(samples: list[Sample], config: ModelConfig) -> Batch:
         truth_new=np.concatenate(is_new),
         truth_closed=np.concatenate([s.truth.closed for s in samples]),
         segmentation=tensor(np.stack([segmentation_target(s.truth, config) for s in samples])),
+        field=tensor(np.stack([field_target(s.truth, config) for s in samples])),
         heat=tensor(np.stack([h for h, _ in heats])),
         cells=tensor(np.concatenate(cells).astype(np.int64)),
         images=images,

@@ -13,7 +13,25 @@ from rtmap_models.config import TinyConfig
 from rtmap_models.queries import Queries
 
 NORMAL_OFFSET_M = 0.8
-"""The picture is read on the line and this far to its left and right."""
+"""The fine map is read on the line and this far to its left and right."""
+
+WIDE_OFFSETS_M = (2.5, 5.0)
+"""The coarse map is read this far to either side too: proposals may be metres off."""
+
+FIELD_SCALE_M = 2.0
+"""Metres per unit of the offset field as a feature."""
+
+
+class Maps(NamedTuple):
+    """What a decoder reads, float32: ``fine`` (B, F, H/2, W/2), ``coarse`` (B, G, h, w), ``side``
+    (B, S, h, w), the coarse map thinned; ``field`` (B, 3 C, H/2, W/2): per class the logit of an
+    element there, and the metres x, y to the nearest one."""
+
+    fine: Tensor
+    coarse: Tensor
+    side: Tensor
+    field: Tensor
+
 
 BLOCKED = -1e4
 """Attention bias of a key that must not be seen (finite, so that an empty row stays defined)."""
@@ -73,6 +91,13 @@ class RefineLayer(nn.Module):
         self.heads, width, point = config.heads, config.query_width, config.point_width
         vertices = config.vertex_count
         self.read = nn.Linear(3 * config.fine_width + config.coarse_width, point)
+        # What came later starts at zero: a network trained without it keeps its answers.
+        self.wide = nn.Linear(2 * len(WIDE_OFFSETS_M) * config.side_width + 9, point, bias=False)
+        nn.init.zeros_(self.wide.weight)
+        self.gate = nn.Linear(64, 1)
+        nn.init.zeros_(self.gate.weight)
+        nn.init.zeros_(self.gate.bias)
+        self.classes = len(config.classes)
         self.place = nn.Linear(4 + 32, point)
         self.ask = nn.Linear(width, point)
         self.vertex = nn.Parameter(torch.randn(vertices, point) * 0.05)
@@ -100,15 +125,15 @@ class RefineLayer(nn.Module):
         self.register_buffer("half_range", half, persistent=False)
         self.register_buffer("frequencies", 2.0 ** torch.arange(8) * math.pi / 2, persistent=False)
 
-    def forward(
-        self, queries: Queries, fine: Tensor, coarse: Tensor, bias: Tensor
-    ) -> tuple[Tensor, LayerOutput]:
-        """Float32 maps (B, ·, h, w) and bias (B, 1, Q, Q) → new features (B, Q, D), output."""
-        q, points = queries
+    def forward(self, queries: Queries, maps: Maps, bias: Tensor) -> tuple[Tensor, LayerOutput]:
+        """Maps and bias (B, 1, Q, Q) → new features (B, Q, D), output."""
+        q, points, class_id = queries
         batch, count, vertices, _ = points.shape
         scaled = points / self.half_range
+        wide, pull = self._look_wide(points, class_id, maps)
         e = F.relu(
-            self.read(self._look(points, fine, coarse))
+            self.read(self._look(points, maps))
+            + self.wide(wide)
             + self.place(self._geometry(points, scaled))
             + self.ask(q)[:, :, None]
             + self.vertex
@@ -122,19 +147,42 @@ class RefineLayer(nn.Module):
         h = F.relu(self.from_point(e) + self.from_query(q)[:, :, None] + self.head_vertex)
         step = self.move(h).float()
         shift = self.whole(q).float().reshape(batch, count, vertices, 2)
-        moved = points + 2.0 * step[..., :2] + 8.0 * shift
+        drawn = self.gate(h).float().sigmoid() * pull
+        moved = points + drawn + 2.0 * step[..., :2] + 8.0 * shift
         return q, LayerOutput(moved, step[..., 2:].clamp(-4, 4), self.classify(q).float())
 
-    def _look(self, points: Tensor, fine: Tensor, coarse: Tensor) -> Tensor:
+    def _look(self, points: Tensor, maps: Maps) -> Tensor:
         """(B, Q, V, 3 · fine + coarse) features on the line, left of it and right of it."""
         batch, count, vertices, _ = points.shape
         t = unit_tangents(points)
         normal = torch.stack([-t[..., 1], t[..., 0]], dim=-1) * NORMAL_OFFSET_M
         at = torch.stack([points, points + normal, points - normal], dim=3)
-        near = sample_map(fine, at.reshape(batch, -1, 2), self.half_range)
-        far = sample_map(coarse, points.reshape(batch, -1, 2), self.half_range)
+        near = sample_map(maps.fine, at.reshape(batch, -1, 2), self.half_range)
+        far = sample_map(maps.coarse, points.reshape(batch, -1, 2), self.half_range)
         near = near.reshape(batch, count, vertices, -1)
         return torch.cat([near, far.reshape(batch, count, vertices, -1)], dim=-1)
+
+    def _look_wide(self, points: Tensor, class_id: Tensor, maps: Maps) -> tuple[Tensor, Tensor]:
+        """(B, Q, V, ·) features metres away and the field of the query's own class, read on the
+        line and beside it; (B, Q, V, 2) metres that the field says the vertex is off."""
+        batch, count, vertices, _ = points.shape
+        t = unit_tangents(points)
+        normal = torch.stack([-t[..., 1], t[..., 0]], dim=-1)
+        at = torch.stack(
+            [points + o * normal for d in WIDE_OFFSETS_M for o in (d, -d)], dim=3
+        ).reshape(batch, -1, 2)
+        wide = sample_map(maps.side, at, self.half_range).reshape(batch, count, vertices, -1)
+        step = normal * NORMAL_OFFSET_M
+        at = torch.stack([points, points + step, points - step], dim=3).reshape(batch, -1, 2)
+        field = sample_map(maps.field, at, self.half_range)
+        field = field.reshape(batch, count, vertices, 3, self.classes, 3)
+        own = F.one_hot(class_id, self.classes).to(field.dtype)[:, :, None, None, :, None]
+        field = (field * own).sum(dim=4)  # (B, Q, V, 3 places, 3)
+        pull = field[:, :, :, 0, 1:]
+        across = (field[..., 1:] * normal[:, :, :, None]).sum(-1)
+        along = (pull * t).sum(-1, keepdim=True)
+        seen = torch.cat([field[..., 0], across / FIELD_SCALE_M, along / FIELD_SCALE_M], dim=-1)
+        return torch.cat([wide, seen, pull / FIELD_SCALE_M], dim=-1), pull
 
     def _geometry(self, points: Tensor, scaled: Tensor) -> Tensor:
         """(B, Q, V, 36): tangent, place within the element, sines and cosines of the position."""
@@ -161,15 +209,18 @@ class Decoder(nn.Module):
     def __init__(self, config: TinyConfig):
         super().__init__()
         self.layers = nn.ModuleList(RefineLayer(config) for _ in range(config.layers))
+        self.side = nn.Conv2d(config.coarse_width, config.side_width, 1)
 
     def forward(
-        self, queries: Queries, fine: Tensor, coarse: Tensor, bias: Tensor
+        self, queries: Queries, fine: Tensor, coarse: Tensor, field: Tensor, bias: Tensor
     ) -> list[LayerOutput]:
-        """Hybrid queries and maps → the output of every layer, the last one being the answer."""
-        fine, coarse = fine.float().contiguous(), coarse.float().contiguous()
+        """Hybrid queries, maps and the offset field (B, 3 C, H/2, W/2) → the output of every
+        layer, the last one being the answer."""
+        side = self.side(coarse).float().contiguous()
+        maps = Maps(fine.float().contiguous(), coarse.float().contiguous(), side, field)
         outputs: list[LayerOutput] = []
         for layer in self.layers:
-            features, output = layer(queries, fine, coarse, bias)
+            features, output = layer(queries, maps, bias)
             outputs.append(output)
-            queries = Queries(features, output.points.detach())
+            queries = Queries(features, output.points.detach(), queries.class_id)
         return outputs

@@ -12,7 +12,14 @@ from rtmap_models.backbone import PictureNet
 from rtmap_models.bev import BevWarp, normalize_picture
 from rtmap_models.config import TinyConfig
 from rtmap_models.decoder import Decoder, LayerOutput, attention_bias
-from rtmap_models.queries import DenseProposals, PriorEncoder, ProposalHead, Queries, join
+from rtmap_models.queries import (
+    DenseProposals,
+    FieldHead,
+    PriorEncoder,
+    ProposalHead,
+    Queries,
+    join,
+)
 
 if TYPE_CHECKING:
     from rtmap_models.dataset import Batch
@@ -24,6 +31,7 @@ class Prediction(NamedTuple):
     layers: list[LayerOutput]
     proposals: DenseProposals
     segmentation: Tensor  # (B, C, H/2, W/2) logits
+    field: Tensor  # (B, C, 2, H/2, W/2) metres to the nearest element of the class
     new_count: int
 
 
@@ -38,6 +46,7 @@ class RTMapNet(AnsweringNet):
         self.picture_net = PictureNet(config)
         self.segment = nn.Conv2d(config.fine_width, len(config.classes), 1)
         nn.init.constant_(self.segment.bias, -2.0)
+        self.field = FieldHead(config)
         self.propose = ProposalHead(config)
         self.encode_prior = PriorEncoder(config)
         self.decoder = Decoder(config)
@@ -62,8 +71,11 @@ class RTMapNet(AnsweringNet):
         count = new.points.shape[1]
         bias = attention_bias(count, prior_mask, prior_visible)
         queries: Queries = join(new, prior)
-        layers = self.decoder(queries, fine, coarse, bias)
-        return Prediction(layers, dense, self.segment(fine).float(), count)
+        drawn, field = self.segment(fine).float(), self.field(fine)
+        # Elements must not bend the field: it learns from its own loss.
+        looked = torch.cat([drawn[:, :, None], field], dim=2).detach().flatten(1, 2)
+        layers = self.decoder(queries, fine, coarse, looked, bias)
+        return Prediction(layers, dense, drawn, field, count)
 
     def forward(
         self,

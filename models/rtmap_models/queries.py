@@ -18,10 +18,12 @@ OFFSET_SCALE = 8.0
 
 
 class Queries(NamedTuple):
-    """What a decoder refines: ``features`` (B, Q, D) and ``points`` (B, Q, V, 2) ego metres."""
+    """What a decoder refines: ``features`` (B, Q, D), ``points`` (B, Q, V, 2) ego metres and
+    ``class_id`` (B, Q), what each was proposed as."""
 
     features: Tensor
     points: Tensor
+    class_id: Tensor
 
 
 class DenseProposals(NamedTuple):
@@ -29,6 +31,23 @@ class DenseProposals(NamedTuple):
 
     heat: Tensor
     points: Tensor
+
+
+class FieldHead(nn.Module):
+    """From every cell, for every class: how far and where the nearest element is."""
+
+    def __init__(self, config: TinyConfig):
+        super().__init__()
+        self.classes = len(config.classes)
+        self.stem = conv_block(config.fine_width, config.field_width)
+        self.offset = nn.Conv2d(config.field_width, 2 * self.classes, 1)
+        nn.init.zeros_(self.offset.weight)
+        nn.init.zeros_(self.offset.bias)
+
+    def forward(self, fine: Tensor) -> Tensor:
+        """Fine map (B, F, H/2, W/2) → (B, C, 2, H/2, W/2) metres, x and y."""
+        offset = self.offset(self.stem(fine)).float() * 2.0
+        return offset.unflatten(1, (self.classes, 2))
 
 
 class ProposalHead(nn.Module):
@@ -77,7 +96,9 @@ class ProposalHead(nn.Module):
         feature = stem.flatten(2).transpose(1, 2)
         feature = feature.gather(1, cell[..., None].expand(-1, -1, feature.shape[-1])).float()
         one_hot = F.one_hot(class_id, self.classes).float()
-        queries = Queries(self.embed(torch.cat([feature, one_hot], dim=-1)).float(), points)
+        queries = Queries(
+            self.embed(torch.cat([feature, one_hot], dim=-1)).float(), points, class_id
+        )
         dense = offsets.reshape(batch, self.classes, rows, columns, self.vertices, 2)
         return queries, DenseProposals(heat, dense + self.centres[:, :, None])
 
@@ -104,7 +125,7 @@ class PriorEncoder(nn.Module):
         used = mask.float()
         one_hot = F.one_hot(class_id.clamp(0, self.classes - 1), self.classes).float()
         features = self.embed(one_hot).float() * used[..., None]
-        return Queries(features, points * used[..., None, None])
+        return Queries(features, points * used[..., None, None], class_id)
 
 
 def join(new: Queries, prior: Queries) -> Queries:
@@ -112,4 +133,5 @@ def join(new: Queries, prior: Queries) -> Queries:
     return Queries(
         torch.cat([new.features, prior.features], dim=1),
         torch.cat([new.points, prior.points], dim=1),
+        torch.cat([new.class_id, prior.class_id.clamp(min=0)], dim=1),
     )

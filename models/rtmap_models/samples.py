@@ -24,6 +24,9 @@ MIN_TRUTH_M = 1.0
 
 MIN_PRIOR_M = 0.5
 MIN_AREA_M2 = 1.0
+FIELD_REACH_M = 5.0
+"""The offset field is learnt this near to the elements of a class."""
+
 HEAT_POSITIVE = 0.4
 """Cells whose heat exceeds this learn the shape of the element."""
 
@@ -273,6 +276,44 @@ def segmentation_target(truth: Pieces, config: ModelConfig) -> NDArray[np.uint8]
             cv2.fillPoly(out[c], [p], 1, 8, 4)
         else:
             cv2.polylines(out[c], [p], False, 1, 2, 8, 4)
+    return out
+
+
+FIELD_STEP_M = 0.2
+
+
+def field_target(truth: Pieces, config: ModelConfig) -> NDArray[np.float32]:
+    """(C, 2, H/2, W/2) metres from the centre of each cell to the nearest point of an element of
+    the class (x, y); NaN further than `FIELD_REACH_M` away and where there is none."""
+    rows, columns = (size // 2 for size in config.picture_size)
+    half, cell = np.array(config.half_range), config.cell_m * 2
+    xs = (np.arange(columns) + 0.5) * cell - half[0]
+    ys = (np.arange(rows) + 0.5) * cell - half[1]
+    out = np.full((len(config.classes), 2, rows, columns), np.nan, np.float32)
+    for c in range(len(config.classes)):
+        lines = truth.points[truth.classes == c]
+        if len(lines) == 0:
+            continue
+        lengths = np.hypot(*np.moveaxis(lines[:, 1:] - lines[:, :-1], -1, 0)).sum(axis=1)
+        dense = np.concatenate(
+            [resample(p, int(n / FIELD_STEP_M) + 2) for p, n in zip(lines, lengths, strict=True)]
+        )
+        column, row = ((dense + half) / cell).astype(np.int64).T
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        row, column, dense = row[inside], column[inside], dense[inside]
+        if len(dense) == 0:
+            continue
+        free = np.ones((rows, columns), np.uint8)
+        free[row, column] = 0
+        _, label = cv2.distanceTransformWithLabels(
+            free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        nearest = np.zeros((label.max() + 1, 2))
+        nearest[label[row, column]] = dense
+        place = nearest[label]
+        dx, dy = place[..., 0] - xs[None], place[..., 1] - ys[:, None]
+        near = np.hypot(dx, dy) < FIELD_REACH_M
+        out[c, 0][near], out[c, 1][near] = dx[near], dy[near]
     return out
 
 
