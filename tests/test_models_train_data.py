@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sample_logs import write_av2_log, write_native_log
+from sample_nuscenes import write_nuscenes
 
 torch = pytest.importorskip("torch", reason="torch is not installed (extra: train)")
 cv2 = pytest.importorskip("cv2", reason="opencv is not installed (extra: train)")
@@ -216,6 +217,15 @@ def test_logs_of_a_folder_with_their_own_maps(rtmap, tiny: Path, tmp_path: Path)
     assert len(list((tmp_path / "cache").iterdir())) == 2
     trained = rtmap(*call, "--threads", 1, "--steps", 1, "--batch", 1, "--device", "cpu")
     assert "written" in trained.err
+
+
+def test_every_scene_of_a_nuscenes_folder(tiny: Path, tmp_path: Path) -> None:
+    folder, config = write_nuscenes(tmp_path / "nuscenes"), load_config(tiny)
+    scenes = logs_in(str(folder))
+    assert len(scenes) > 1
+    made = gather([scenes[0]], config, tmp_path / "cache", spacing_m=0.1)
+    assert len(Frames(made, config)) > 1
+    assert len(Frames(made, config)[0].scene.classes)
 
 
 def test_what_is_no_data(tmp_path: Path, tiny: Path) -> None:

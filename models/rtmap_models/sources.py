@@ -65,9 +65,9 @@ def gather(
     Argoverse 2, nuScenes …), a nuScenes folder with all its scenes or a folder of logs as folders
     in ``cache``, made where they are not there yet, ``workers`` logs at a time.
 
-    ``map_path`` is the truth of every log (needed for native ones; Argoverse 2 logs bring their
-    own). ``spacing_m`` between frames of a log, metres. BadInput when something is neither frames
-    nor a log, and for what is wrong in one.
+    ``map_path`` is the truth of every log (needed for native ones; Argoverse 2 and nuScenes bring
+    their own). ``spacing_m`` between frames of a log, metres. BadInput when something is neither
+    frames nor a log, and for what is wrong in one.
     """
     keep = config.needs_images if keep_images is None else keep_images
     folders: list[Path] = []
@@ -218,7 +218,10 @@ def _cameras_of(
     projections = np.zeros((len(cameras), 3, 4), np.float32)
     for k, (name, camera) in enumerate(cameras.items()):
         if name in frame.images:
-            images[k] = camera.load(frame.images[name])
+            try:
+                images[k] = camera.load(frame.images[name])
+            except BadInput as error:
+                raise BadInput(error.where, error.what, "mend the image or take it away") from None
             projections[k] = camera.at(frame.ego_SE3_exposure.get(name))
     return images, projections
 
@@ -244,6 +247,12 @@ def _truth(job: LogJob, log: Log) -> VectorMap:
         from rtmap_cli.formats.av2_map import read_av2_map
 
         return read_av2_map(log.path)
+    location = getattr(log, "location", None)
+    if kind == "nuscenes" and location is not None:
+        from rtmap_cli.formats.nuscenes_map import read_nuscenes_map
+
+        folder = log.path if (log.path / "maps").is_dir() else log.path.resolve().parent
+        return read_nuscenes_map(folder, location)
     raise BadInput(log.path, "the log brings no map of its own", "pass --map with the true map")
 
 
