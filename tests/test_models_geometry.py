@@ -13,10 +13,12 @@ from rtmap_models.bev import BevWarp, camera_centres, cell_centres  # noqa: E402
 from rtmap_models.config import load_config  # noqa: E402
 from rtmap_models.pose import PoseHead, inverse3, solve3  # noqa: E402
 from rtmap_models.samples import (  # noqa: E402
+    FIELD_REACH_M,
     PriorNoise,
     Scene,
     clip,
     equivalent_orders,
+    field_target,
     heat_target,
     make_prior,
     rotation,
@@ -184,3 +186,21 @@ def test_dense_targets() -> None:
     segmentation = segmentation_target(truth, config)
     assert segmentation.shape == (3, 72, 144)
     assert segmentation[0, 36, 72 + 24] == 1 and segmentation[0, 36, 72] == 0
+
+
+def test_field_points_to_the_nearest_element() -> None:
+    config = load_config()
+    field = field_target(clip(ROAD, config), config)
+    rows, columns = (size // 2 for size in config.picture_size)
+    assert field.shape == (3, 2, rows, columns)
+    centres = cell_centres(*config.half_range, rows, columns).numpy()
+    x, y = centres[..., 0], centres[..., 1]
+    divider, near = field[1], np.abs(y) < FIELD_REACH_M - 0.2
+    assert np.abs(divider[1] + y)[near].max() < 0.05 and np.abs(divider[0])[near].max() < 0.36
+    assert np.isnan(divider[:, np.abs(y) > FIELD_REACH_M + 0.2]).all()
+    # The long sides x = 10 and 14 are nearest; half a cell from the middle either may be.
+    inside = (x > 11) & (x < 13) & (np.abs(x - 12) > 0.5) & (np.abs(y) < 2)
+    away = np.abs(x + field[0, 0] - np.where(x < 12, 10, 14))[inside]
+    assert away.max() < 0.05
+    crossing_only = scene_of((0, [[10, -5], [14, -5], [14, 5], [10, 5], [10, -5]]))
+    assert np.isnan(field_target(clip(crossing_only, config), config)[1:]).all()
