@@ -107,7 +107,7 @@ def simulate(folder: Path, frames: int) -> tuple[Path, Path]:
     """A drive through a simulated town with the default rig: its log and its map."""
     town, log = folder / "town", folder / "log"
     _rtmap("simulate", "town", "--seed", 5, "-o", town)
-    more = ("--route", "turning", "--frames", frames, "--seed", 5)
+    more = ("--log", "town:", "--frames", frames, "--length", 2.5 * frames, "--seed", 5)
     _rtmap("simulate", "images", "--map", town, "-o", log, *more)
     return log, town
 
