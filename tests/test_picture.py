@@ -118,7 +118,7 @@ def test_lines_move_with_the_vehicle_between_image_and_frame() -> None:
 
         blank = np.zeros((400, 640, 3), np.uint8)
         with mock.patch("rtmap_cli.logs.native.decode_image", return_value=blank):
-            views.append(_stored(Log(), f, camera))
+            views.append(_stored(Log(), f, np.zeros(3), camera))
     # Seen from a metre farther back, a point looks as one a metre farther ahead.
     near, far = np.array([[10.0, 2.0, 0.0]]), np.array([[11.0, 2.0, 0.0]])
     np.testing.assert_allclose(views[1].project(near), views[0].project(far), atol=1e-9)
@@ -161,6 +161,24 @@ def test_bad_input_is_one_line(rtmap: Call, tmp_path: Path) -> None:
     rtmap("picture", log, *out, "--overwrite")
     (log / "images.parquet").unlink()
     assert "no images" in rtmap("picture", log, *out, "--overwrite", code=3).err
+
+
+def test_lines_follow_the_slope_of_the_path(rtmap: Call, tmp_path: Path) -> None:
+    camera = _camera("pinhole", (0.0, 0.0, 0.0))
+    folder = tmp_path / "log"
+    folder.mkdir()
+    writer = NativeLogWriter(folder, "hill", CRS, Rig((camera,)), ground_z=GROUND)
+    # Level vehicle, road that rises by 5 % along the drive: a slope begins here.
+    for k, x in enumerate(np.arange(0.0, 60.0, 2.0)):
+        pose = se3_from_xyyaw(500_000.0 + x, 5_400_000.0, 0.0, 0.05 * x)
+        writer.add(Frame(k, 10**18 + k, pose, np.ones(3)), {"front": jpeg(20, (640, 400))})
+    writer.close()
+    rtmap("picture", folder, "--grid", "-o", tmp_path / "g.png", "--width", 640)
+    pixels = _pixels(tmp_path / "g.png")
+    road = np.array([[36.0, 4.0, GROUND], [36.0, 4.0, GROUND + 36.0 * 0.05]])
+    at = camera.project(transform(invert(camera.ego_SE3_camera), road))
+    assert at[0][1] - at[1][1] > 10
+    assert _coloured(pixels, at[1], YELLOW) and not _coloured(pixels, at[0], YELLOW)
 
 
 def test_lines_behind_the_camera_are_left_out() -> None:

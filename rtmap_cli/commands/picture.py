@@ -11,6 +11,7 @@ from rtmap_cli import options
 
 if TYPE_CHECKING:
     from rtmap_cli.logs.log import Frame, Log
+    from rtmap_cli.maps.element import VectorMap
     from rtmap_cli.steps.infer.model import ModelInfo
     from rtmap_cli.steps.picture import GroundLine, View
 
@@ -53,7 +54,8 @@ def command(
     """Show the cameras of one frame of LOG, with a grid, a map or detections drawn on the road.
 
     A grid that follows the lane lines shows that calibration, lens and poses are read as meant.
-    All lines lie on the plane of the road under the vehicle: where it slopes they leave it.
+    All lines lie on the plane that infer takes for the road: how it slopes tell the heights of the
+    map, else those of the log's path.
 
     \b
     Example:
@@ -62,8 +64,10 @@ def command(
     from rtmap_cli.errors import BadInput
     from rtmap_cli.logs.open import notes_of, open_log
     from rtmap_cli.maps.crop import DEFAULT_RANGE
+    from rtmap_cli.maps.store import read_map
     from rtmap_cli.output import emit, log
     from rtmap_cli.steps.infer import MapModel
+    from rtmap_cli.steps.infer.levelling import RoadUnder
     from rtmap_cli.steps.picture import draw_views, grid_lines
     from rtmap_cli.tables import refuse_inside, whole_file
 
@@ -77,10 +81,12 @@ def command(
         log(f"{source.log_id}: {note}")
     frame = _frame(source, number)
     model = MapModel(as_seen).info if as_seen else None
-    views = _views(source, frame, model, width)
+    vector_map = read_map(map_path, map_version) if map_path is not None else None
+    road = RoadUnder([f.map_SE3_ego for f in source.frames()], vector_map)
+    views = _views(source, frame, road.plane(frame.map_SE3_ego), model, width)
     lines = grid_lines(model.range_m if model else DEFAULT_RANGE) if grid else []
-    if map_path is not None:
-        lines += _of_map(source, frame, map_path, map_version)
+    if vector_map is not None:
+        lines += _of_map(source, frame, vector_map, str(map_path))
     if run_path is not None:
         lines += _of_run(source, frame, run_path, score_threshold)
     picture = draw_views(views, lines, f"{source.log_id}, frame {frame.index}")
@@ -99,18 +105,22 @@ def _frame(log: Log, number: int | None) -> Frame:
     return found[0]
 
 
-def _views(log: Log, frame: Frame, model: ModelInfo | None, width: int) -> list[View]:
-    """The images of a frame, as they are stored or as a model gets them."""
+def _views(log: Log, frame: Frame, plane: Any, model: ModelInfo | None, width: int) -> list[View]:
+    """The images of a frame, as they are stored or as a model gets them; ``plane`` (3,): z of the
+    road above the place under the vehicle is a x + b y + c."""
     from rtmap_cli.errors import BadInput
 
     cameras = [c for c in log.rig or () if c.name in frame.images]
     if not cameras:
         raise BadInput(log.path, f"frame {frame.index} has no images with calibration")
-    shown = [_seen(log, frame, c, model) if model else _stored(log, frame, c) for c in cameras]
+    shown = [
+        _seen(log, frame, plane, c, model) if model else _stored(log, frame, plane, c)
+        for c in cameras
+    ]
     return [_scaled(view, width) for view in shown]
 
 
-def _stored(log: Log, frame: Frame, camera: Any) -> View:
+def _stored(log: Log, frame: Frame, plane: Any, camera: Any) -> View:
     """The image as it lies on disk, lens and all."""
     import numpy as np
     from PIL import Image
@@ -125,22 +135,24 @@ def _stored(log: Log, frame: Frame, camera: Any) -> View:
     ratio = np.array(pixels.shape[1::-1]) / [camera.width, camera.height]
 
     def project(points: Any) -> Any:
-        lifted = points + np.array([0.0, 0.0, log.ground_z])
+        lifted = np.array(points, np.float64)
+        lifted[:, 2] += log.ground_z + points[:, :2] @ plane[:2] + plane[2]
         return (camera.project(transform(camera_SE3_ego, lifted)) + 0.5) * ratio - 0.5
 
     return View(camera.name, Image.fromarray(pixels), project)
 
 
-def _seen(log: Log, frame: Frame, camera: Any, model: ModelInfo) -> View:
+def _seen(log: Log, frame: Frame, plane: Any, camera: Any, model: ModelInfo) -> View:
     """The image and the projection that a model is given."""
     import numpy as np
     from PIL import Image
 
+    from rtmap_cli.geometry.cameras import levelled
     from rtmap_cli.steps.infer.images import FittedCamera
     from rtmap_cli.steps.picture import View
 
     fitted = FittedCamera(camera, model.image_size, model.horizon, log.ground_z)
-    matrix = fitted.at(frame.ego_SE3_exposure.get(camera.name)).astype(np.float64)
+    matrix = levelled(fitted.at(frame.ego_SE3_exposure.get(camera.name)), plane)
 
     def project(points: Any) -> Any:
         u = points @ matrix[:, :3].T + matrix[:, 3]
@@ -162,15 +174,13 @@ def _scaled(view: View, width: int) -> View:
     return View(view.name, image, lambda p: (view.project(p) + 0.5) * scale - 0.5)
 
 
-def _of_map(log: Log, frame: Frame, path: Path, version: int | None) -> list[GroundLine]:
+def _of_map(log: Log, frame: Frame, vector_map: VectorMap, where: str) -> list[GroundLine]:
     """The map around the frame's initial pose, on the plane of the road."""
     from rtmap_cli.maps.crop import MapIndex
     from rtmap_cli.maps.crs import check_same_crs
-    from rtmap_cli.maps.store import read_map
     from rtmap_cli.steps.picture import element_lines
 
-    vector_map = read_map(path, version)
-    check_same_crs(vector_map.crs, log.crs, path)
+    check_same_crs(vector_map.crs, log.crs, where)
     local = MapIndex(vector_map).crop(frame.map_SE3_ego)
     return element_lines([e.class_name for e in local], [e.points[:, :2] for e in local])
 
