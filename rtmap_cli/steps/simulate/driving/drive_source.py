@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from rtmap_cli.steps.simulate.driving.drive import town_drive, town_lanes
 from rtmap_cli.steps.simulate.driving.drives import Drive, drive_of_log
 from rtmap_cli.steps.simulate.driving.routes import Lane
 from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+from rtmap_cli.steps.simulate.worlds.heights import ground_of, stand_on
 from rtmap_cli.steps.simulate.worlds.world import even_odd_surface
 
 Array = NDArray[np.float64]
@@ -61,6 +62,7 @@ def find_source(
         surface = even_odd_surface(vector_map)
         lanes = town_lanes(town_info(town), vector_map, surface, town)
         drive = town_drive(lanes, vector_map.crs, key, route.kind, route.length, route.spacing)
+        drive = replace(drive, pose=stand_on(ground_of(vector_map), drive.pose))
         return Source(drive, None, 0.0, lanes)
     log = open_log(spec)
     check_same_crs(vector_map.crs, log.crs, map_path)

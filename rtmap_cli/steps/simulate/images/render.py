@@ -1,7 +1,7 @@
 """Camera images of a world: the ground sampled per pixel, boxes drawn over it, light and noise.
 
-The ground is the plane under the vehicle (ego z = ``ground_z``); slopes away from the vehicle are
-not rendered. Colours are mixed linearly from the layers of ``world_ground``.
+The ground follows the heights of the map; over a map without any it is the plane under the vehicle
+(ego z = ``ground_z``). Colours are mixed linearly from the layers of ``world_ground``.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rtmap_cli.geometry.poses import xyyaw_of
 from rtmap_cli.logs.log import Camera, Occluder
 from rtmap_cli.steps.simulate.images.render_boxes import draw_boxes, scene_boxes
+from rtmap_cli.steps.simulate.images.slopes import Terrain, lattice
 from rtmap_cli.steps.simulate.images.style import Style
 from rtmap_cli.steps.simulate.worlds.world import World
 from rtmap_cli.steps.simulate.worlds.world_ground import ground_window, noise_fields, opencv
@@ -46,8 +47,9 @@ def render_cameras(
 ) -> list[Image]:
     """What the cameras of a vehicle see: one (H, W, 3) uint8 RGB image per camera.
 
-    ``map_SE3_ego`` is the true pose (x, y and yaw count), ``occluders`` are vehicles in the ego
-    frame, ``ground_z`` the height of the road in it (m). The body's small pitch, roll and heave,
+    ``map_SE3_ego`` is the true pose (over flat ground only x, y and yaw count), ``occluders`` are
+    vehicles in the ego frame (on slopes they stand on the ground), ``ground_z`` is the height of
+    the road in it (m). The body's small pitch, roll and heave,
     the exposure and the noise are drawn from ``rng`` (``body``, `body_motion`, if the caller wants
     to know what the vehicle does not). Distortion k1, k2, k3 is applied where a
     camera has any.
@@ -61,14 +63,19 @@ def render_cameras(
         ground_window(world, x, y, half, k, base) for k, half in enumerate(HALF_WIDTHS[base])
     ]
     palette = _palette(style)
-    boxes = scene_boxes(world, map_SE3_ego, occluders, style, ground_z)
+    terrain = None
+    if world.ground:
+        terrain = Terrain.around(world.ground, map_SE3_ego, ground_z)
+        body = terrain.level_SE3_ego @ body
+    boxes = scene_boxes(world, map_SE3_ego, occluders, style, ground_z, terrain)
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     images = []
     for camera in cameras:
         pose = body @ camera.ego_SE3_camera
         image = _ground_and_sky(
-            cv2, camera, pose, windows, base, (float(x), float(y)), turn, palette, style, ground_z
-        )
+            cv2, camera, pose, windows, base, (float(x), float(y)), turn, palette, style,
+            terrain or ground_z,
+        )  # fmt: skip
         draw_boxes(cv2, image, camera, pose, boxes, style)
         images.append(_finish(cv2, image, camera, style, rng))
     return images
@@ -120,14 +127,31 @@ def _palette(style: Style) -> tuple[Floats, Floats]:
     return (a / 255).astype(np.float32), (b / 255).astype(np.float32)
 
 
+Optics = tuple[tuple[float, ...], tuple[float, ...]]
+"""(fx, fy, cx, cy, skew) and distortion k1, k2, k3 of a camera."""
+
+
+def _optics(camera: Camera) -> Optics:
+    k = camera.intrinsics
+    key = (k[0, 0], k[1, 1], k[0, 2], k[1, 2], k[0, 1])
+    return tuple(float(v) for v in key), tuple(camera.distortion)
+
+
 @lru_cache(maxsize=64)
-def _rays(
-    width: int, height: int, k: tuple[float, ...], distortion: tuple[float, ...], rows: int
-) -> tuple[Floats, Floats]:
+def _rays(width: int, height: int, optics: Optics, rows: int) -> tuple[Floats, Floats]:
     """Normalised image coordinates (x, y) of ``rows`` samples per image row, undistorted."""
-    fx, fy, cx, cy, skew = k
     v = (np.arange(height * rows) + 0.5) / rows - 0.5
-    u, v = np.meshgrid(np.arange(width), v)
+    return _undistorted(*np.meshgrid(np.arange(width), v), optics)
+
+
+@lru_cache(maxsize=64)
+def _lattice_rays(width: int, height: int, optics: Optics) -> tuple[Floats, Floats]:
+    """Normalised image coordinates of the lattice on which hills are looked for."""
+    return _undistorted(*lattice(width, height)[1:], optics)
+
+
+def _undistorted(u: NDArray[Any], v: NDArray[Any], optics: Optics) -> tuple[Floats, Floats]:
+    (fx, fy, cx, cy, skew), distortion = optics
     yd = (v - cy) / fy
     xd = (u - cx - skew * yd) / fx
     x, y = xd.copy(), yd.copy()
@@ -150,24 +174,32 @@ def _ground_and_sky(
     turn: Array,
     palette: tuple[Floats, Floats],
     style: Style,
-    ground_z: float,
+    ground: Terrain | float,
 ) -> Floats:
-    """The image before boxes: ground below the horizon, sky above, haze between; float32."""
+    """The image before boxes: ground below the horizon, sky above, haze between; float32.
+
+    ``ground``: hills, or the height of a plane in the frame of ``pose`` (m).
+    """
     width, height = camera.width, camera.height
-    k = camera.intrinsics
-    fx, fy = float(k[0, 0]), float(k[1, 1])
+    optics = _optics(camera)
+    fx = optics[0][0]
     rows = 2 if fx < 420 else 1
-    key = (fx, fy, float(k[0, 2]), float(k[1, 2]), float(k[0, 1]))
-    rx, ry = _rays(width, height, key, tuple(camera.distortion), rows)
+    rx, ry = _rays(width, height, optics, rows)
     r = pose[:3, :3].astype(np.float32)
     down = r[2, 0] * rx + r[2, 1] * ry + r[2, 2]
-    rise = np.float32(pose[2, 3] - ground_z)
+    slope = down
+    if isinstance(ground, Terrain):
+        rays = _lattice_rays(width, height, optics)
+        seen, lifted = ground.slant(cv2, width, height, rows, rays, pose)
+        rise, down = np.float32(lifted), -seen
+    else:
+        rise = np.float32(pose[2, 3] - ground)
     out = np.empty((height, width, 3), np.float32)
     # The horizon may be tilted: the first rows hold no ground, the last ones no sky.
     low, high = down.reshape(height, -1).min(axis=1), down[::rows].max(axis=1)
     first = int(np.argmax(low < -HORIZON)) if (low < -HORIZON).any() else height
     last = height - int(np.argmax(high[::-1] >= -HORIZON)) if (high >= -HORIZON).any() else 0
-    _paint_sky(out[:last], down[: last * rows : rows], style)
+    _paint_sky(out[:last], slope[: last * rows : rows], style)
     if first == height:
         return out
     part = slice(first * rows, None)
@@ -188,8 +220,8 @@ def _ground_and_sky(
     colour += haze
     mixed = last - first
     if mixed > 0:
-        ground = down[: mixed * rows : rows] < -HORIZON
-        out[first:last][ground] = colour[:mixed][ground]
+        below = down[: mixed * rows : rows] < -HORIZON
+        out[first:last][below] = colour[:mixed][below]
     out[max(first, last) :] = colour[max(mixed, 0) :]
     return out
 
@@ -236,8 +268,10 @@ def _sample(
             layer = cv2.remap(
                 windows[k][n], fixed, weights, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
             )
-            if rows > 1:
-                layer = cv2.resize(layer, (mx.shape[1], end - start), interpolation=cv2.INTER_AREA)
+            if rows > 1:  # at half size linear interpolation is the mean of two rows
+                layer = cv2.resize(
+                    layer, (mx.shape[1], end - start), interpolation=cv2.INTER_LINEAR
+                )
             out[n][start:end] = layer
     return out[0], out[1]
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.poses import transform
 from rtmap_cli.logs.log import Camera, Occluder
+from rtmap_cli.steps.simulate.images.slopes import Terrain
 from rtmap_cli.steps.simulate.images.style import Style
 from rtmap_cli.steps.simulate.worlds.world_objects import CROWN, OBJECT_COLUMNS, objects_near
 
@@ -33,13 +36,24 @@ def scene_boxes(
     occluders: Sequence[Occluder],
     style: Style,
     ground_z: float,
+    terrain: Terrain | None = None,
 ) -> Array:
     """(n, 11) boxes in the ego frame, far ones first: roadside objects and vehicles.
 
-    The parts of a vehicle keep their order, whatever their own distances.
+    The parts of a vehicle keep their order, whatever their own distances. On a ``terrain`` the
+    boxes are in its level frame, and everything stands upright on it.
     """
     still = objects_near(world, map_SE3_ego)
-    still[:, 5:7] += ground_z
+    if terrain:
+        still[:, 5:7] += terrain.heights(still[:, :2])[:, None]
+        places = np.array([[o.x, o.y, o.z] for o in occluders]).reshape(-1, 3)
+        xy = transform(terrain.level_SE3_ego, places)[:, :2]
+        occluders = [
+            replace(o, x=float(x), y=float(y), z=float(z))
+            for o, (x, y), z in zip(occluders, xy, terrain.heights(xy), strict=True)
+        ]
+    else:
+        still[:, 5:7] += ground_z
     rows: list[list[float]] = []
     away: list[float] = []
     for vehicle in occluders:

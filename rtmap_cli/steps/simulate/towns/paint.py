@@ -51,7 +51,7 @@ def lay_dividers(
     """Painted lines between the stop lines; they stop at crossings and where asphalt ends."""
     keep = surface.buffer(-0.1)
     if crossings:
-        keep = keep.difference(shapely.union_all(shapely.polygons(crossings)).buffer(0.8))
+        keep = keep.difference(shapely.union_all(shapely.buffer(shapely.polygons(crossings), 0.8)))
     shapely.prepare(keep)
     out: list[tuple[Array, str]] = []
     for index, street in enumerate(streets):

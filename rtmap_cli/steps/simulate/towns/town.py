@@ -14,6 +14,7 @@ from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.steps.simulate.towns.asphalt import lay_asphalt
 from rtmap_cli.steps.simulate.towns.crossings import Crossing, lay_crossings
 from rtmap_cli.steps.simulate.towns.fittings import fit_out
+from rtmap_cli.steps.simulate.towns.hills import SPACING, Hills
 from rtmap_cli.steps.simulate.towns.junctions import (
     find_junctions,
     make_roundabout,
@@ -49,7 +50,8 @@ def make_town(seed: int, size: float = DEFAULT_SIZE, roundabout: bool | None = N
     """A town drawn from ``seed``; ``size`` metres across (150 gives a single junction or two).
 
     ``roundabout`` None: always one in towns of 300 m and more, in every tenth smaller scene.
-    The map frame is EPSG:32632 around 500 km east, 5,400 km north; the town is flat, z = 0.
+    The map frame is EPSG:32632 around 500 km east, 5,400 km north; three towns of four lie on
+    gentle hills (up to 8 %), the others are flat, z = 0.
     Classes: ``boundary`` closed outlines of the asphalt, ``divider`` painted lines with their
     ``mark``, ``ped_crossing`` quads with their ``pattern``.
     """
@@ -68,7 +70,8 @@ def make_town(seed: int, size: float = DEFAULT_SIZE, roundabout: bool | None = N
     rings = [ring for ring, _ in crossings]
     dividers = lay_dividers(rng, streets, junctions, turning, rings, surface)
     lanes = lane_network(streets, junctions)
-    return _assemble(seed, size, surface, dividers, crossings, lanes)
+    hills = Hills(rng, surface)
+    return _assemble(seed, size, surface, dividers, crossings, lanes, hills)
 
 
 def _assemble(
@@ -78,14 +81,16 @@ def _assemble(
     dividers: list[tuple[Array, str]],
     crossings: list[Crossing],
     lanes: list[Array],
+    hills: Hills,
 ) -> Town:
     """Shift everything to the map frame and number the elements."""
     elements: list[Element] = []
 
     def add(class_name: str, points: Array, **attributes: str) -> None:
-        flat = np.column_stack([points + TOWN_ORIGIN, np.zeros(len(points))])
+        draped = hills.drape(points, np.inf if class_name == "ped_crossing" else SPACING)
+        placed = draped + (*TOWN_ORIGIN, 0.0)
         name = f"{class_name}-{sum(e.class_name == class_name for e in elements):04d}"
-        elements.append(Element(name, class_name, flat, attributes=attributes))
+        elements.append(Element(name, class_name, placed, attributes=attributes))
 
     for ring, pattern in crossings:
         if surface.intersects(shapely.polygons(ring)):

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import arc_length, is_ring, join_lines, normals, resample_step
 from rtmap_cli.maps.element import Element, VectorMap
+from rtmap_cli.steps.simulate.worlds.heights import Ground, ground_of
+from rtmap_cli.steps.simulate.worlds.world_objects import roadside
 
 Array = NDArray[np.float64]
 
@@ -34,7 +36,7 @@ class World:
     ``surface``: the asphalt; ``curbs``: lines (n, 2) with a curb; ``soft``: asphalt edges where the
     curb is gone (the ground beside them is paved too). ``seed`` fixes the wear of paint, which
     is a field over the map frame: the same place looks the same in every drive. ``tiles`` caches
-    the rasterised ground.
+    the rasterised ground. ``ground`` holds the heights, None over a flat map.
     """
 
     vector_map: VectorMap
@@ -46,6 +48,7 @@ class World:
     seed: int = 0
     tiles: dict[tuple[float, int, int], Any] = field(default_factory=dict, repr=False)
     boxes: dict[str, Array] = field(default_factory=dict, repr=False)
+    ground: Ground | None = None
 
 
 def world_from_map(
@@ -70,9 +73,9 @@ def world_from_map(
     width = float(rng.uniform(0.3, 0.55))
     for element in vector_map.of_class("ped_crossing"):
         paint += _crossing_paint(element, width, seed)
-    from rtmap_cli.steps.simulate.worlds.world_objects import roadside
-
-    return World(vector_map, surface, curbs, gaps, paint, roadside(surface, seed), seed)
+    ground = ground_of(surface_map or vector_map)
+    objects = roadside(surface, seed)
+    return World(vector_map, surface, curbs, gaps, paint, objects, seed, ground=ground)
 
 
 def rng_for(element: Element, seed: int) -> np.random.Generator:

@@ -61,7 +61,7 @@ def noise_fields() -> NDArray[np.float32]:
 
 @cache
 def _ground_noise() -> NDArray[np.float32]:
-    """(1024, 1024, 5): what the ground takes of the noise, one pixel per NOISE_STEP metres.
+    """(5, 1024, 1024): what the ground takes of the noise, one pixel per NOISE_STEP metres.
 
     Texture of asphalt and verge (mean one half), blotches of old asphalt, fine and broad wear.
     """
@@ -73,17 +73,18 @@ def _ground_noise() -> NDArray[np.float32]:
             broad * 0.6 + coarse * 0.8 - 1.6,
             1.05 - 0.1 * np.abs(middle) - 0.08 * fine,
             0.6 + 0.5 * broad,
-        ],
-        axis=-1,
+        ]
     )
 
 
 def _noise(x0: float, y0: float, step: float) -> NDArray[np.float32]:
-    """(256, 256, 5) noise of a tile with this lower left corner."""
+    """(5, 256, 256) noise of a tile with this lower left corner."""
     k = (np.arange(TILE) + 0.5) * step
     cols = np.floor((x0 + k) / NOISE_STEP).astype(np.int64) % NOISE_SIZE
     rows = np.floor((y0 + k) / NOISE_STEP).astype(np.int64) % NOISE_SIZE
-    return _ground_noise().reshape(-1, 5)[rows[:, None] * NOISE_SIZE + cols]
+    at = (rows[:, None] * NOISE_SIZE + cols).ravel()
+    planes = [plane.take(at) for plane in _ground_noise().reshape(5, -1)]
+    return np.stack(planes).reshape(5, TILE, TILE)
 
 
 def _layout(world: World) -> dict[str, Any]:
@@ -156,22 +157,20 @@ def draw_tile(world: World, x0: float, y0: float, step: float, level: int) -> Im
         p = ((points - (x0 - step, y0 - step)) * scale - 0.5) * (1 << SUBPIXEL)
         return np.round(p).astype(np.int32)
 
-    def fill(polygons: list[NDArray[np.int32]], even_odd: bool) -> Image:
+    def fill(area: Any) -> Image | None:
+        rings = [pixels(r) for r in _rings_of(area)]
+        if not rings:
+            return None
         mask = np.zeros((size, size), np.uint8)
-        if even_odd and polygons:
-            cv2.fillPoly(mask, polygons, 255, cv2.LINE_8, SUBPIXEL)
-        else:
-            for polygon in polygons:
-                cv2.fillPoly(mask, [polygon], 255, cv2.LINE_8, SUBPIXEL)
+        cv2.fillPoly(mask, rings, 255, cv2.LINE_8, SUBPIXEL)
         return mask
 
     window = shapely.box(x0 - margin, y0 - margin, x0 + side + margin, y0 + side + margin)
     area = shapely.intersection(world.surface, window)
-    asphalt = fill([pixels(r) for r in _rings_of(area)], True)
+    asphalt = fill(area)
     outer = asphalt
     if layout["sidewalk_width"] and not area.is_empty:
-        wide = shapely.buffer(area, layout["sidewalk_width"], quad_segs=2)
-        outer = fill([pixels(r) for r in _rings_of(wide)], True)
+        outer = fill(shapely.buffer(area, layout["sidewalk_width"], quad_segs=2))
     curb = _draw_curbs(cv2, world, layout, (x0, y0, side), pixels, size, scale)
     white, yellow = _draw_paint(cv2, world, layout, (x0, y0, side), pixels, size)
     soft = _touching(layout["soft"], x0 - 12, y0 - 12, x0 + side + 12, y0 + side + 12)
@@ -180,14 +179,17 @@ def draw_tile(world: World, x0: float, y0: float, step: float, level: int) -> Im
     shares = []
     for mask in layers:
         share = np.zeros((TILE, TILE), np.float32)
-        if mask.any():
-            small = cv2.resize(mask[inner, inner], (TILE, TILE), interpolation=cv2.INTER_AREA)
+        if mask is not None:
+            small = mask[inner, inner]
+            for wide in (4 * TILE, TILE):  # by four at once it is quick
+                if len(small) > wide:
+                    small = cv2.resize(small, (wide, wide), interpolation=cv2.INTER_AREA)
             np.multiply(small, np.float32(1 / 255), out=share)
         shares.append(share)
     if len(soft):
         paved = _soften(cv2, world, soft, (x0, y0, side))
         shares[:2] = [np.maximum(shares[0], paved), np.maximum(shares[1], paved)]
-    return _mix(layout, x0, y0, step, shares)
+    return _mix(cv2, layout, x0, y0, step, shares)
 
 
 def _rings_of(area: Any) -> list[Array]:
@@ -202,10 +204,10 @@ def _rings_of(area: Any) -> list[Array]:
 def _draw_curbs(
     cv2: Any, world: World, layout: dict[str, Any], box: tuple[float, float, float],
     pixels: Any, size: int, scale: float,
-) -> Image:  # fmt: skip
+) -> Image | None:  # fmt: skip
     """Curbs as thin strips along the boundaries."""
     x0, y0, side = box
-    mask = np.zeros((size, size), np.uint8)
+    mask: Image | None = None
     width = layout["curb_width"]
     window = (x0 - 2, y0 - 2, x0 + side + 2, y0 + side + 2)
     for k in _touching(layout["curb"], *window):
@@ -215,6 +217,7 @@ def _draw_curbs(
         strip = shapely.buffer(line, width / 2, cap_style="flat", join_style="mitre")
         rings = [pixels(r) for r in _rings_of(strip)]
         if rings:
+            mask = np.zeros((size, size), np.uint8) if mask is None else mask
             cv2.fillPoly(mask, rings, 255, cv2.LINE_8, SUBPIXEL)
     return mask
 
@@ -222,13 +225,15 @@ def _draw_curbs(
 def _draw_paint(
     cv2: Any, world: World, layout: dict[str, Any], box: tuple[float, float, float],
     pixels: Any, size: int,
-) -> tuple[Image, Image]:  # fmt: skip
+) -> tuple[Image | None, Image | None]:  # fmt: skip
     x0, y0, side = box
-    masks = {"white": np.zeros((size, size), np.uint8), "yellow": np.zeros((size, size), np.uint8)}
+    masks: dict[str, Image] = {}
     for k in _touching(layout["paint"], x0, y0, x0 + side, y0 + side):
         paint = world.paint[k]
+        if paint.colour not in masks:
+            masks[paint.colour] = np.zeros((size, size), np.uint8)
         cv2.fillPoly(masks[paint.colour], [pixels(paint.polygon)], 255, cv2.LINE_8, SUBPIXEL)
-    return masks["white"], masks["yellow"]
+    return masks.get("white"), masks.get("yellow")
 
 
 def _soften(
@@ -251,6 +256,7 @@ def _soften(
 
 
 def _mix(
+    cv2: Any,
     layout: dict[str, Any],
     x0: float,
     y0: float,
@@ -264,7 +270,7 @@ def _mix(
     asphalt, outer, curb, white, yellow = drawn
     ox, oy = layout["offset"]
     noise = _noise(x0 + ox * 10, y0 + oy * 10, step)
-    texture, verge, blotches, fine_wear, broad_wear = np.moveaxis(noise, -1, 0)
+    texture, verge, blotches, fine_wear, broad_wear = noise
     wear = np.clip(fine_wear - np.float32(layout["wear"]) * broad_wear, 0.12, 1.0)
     white, yellow = white * wear, yellow * wear
     white = np.minimum(white, 1 - yellow)
@@ -274,9 +280,6 @@ def _mix(
     road = asphalt * left
     side = np.clip(outer - asphalt, 0, 1) * left
     patch = np.clip((blotches + np.float32(layout["patches"])) * 4, 0, 1)
-    out = np.empty((2, TILE, TILE, 4), np.float32)
-    for k, layer in enumerate((side, curb, road, white)):
-        out[0, ..., k] = layer
-    for k, layer in enumerate((yellow, road * texture, (1 - road) * verge, road * patch)):
-        out[1, ..., k] = layer
-    return (out * 255 + 0.5).astype(np.uint8)
+    first = cv2.merge([side, curb, road, white])
+    second = cv2.merge([yellow, road * texture, (1 - road) * verge, road * patch])
+    return np.stack([cv2.convertScaleAbs(layer, alpha=255.0) for layer in (first, second)])
