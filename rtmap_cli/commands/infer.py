@@ -41,6 +41,12 @@ from rtmap_cli.output import emit, log, progress
 @click.option(
     "--every", type=click.IntRange(1), default=1, show_default=True, help="Take every n-th frame."
 )
+@click.option(
+    "--level/--no-level",
+    default=True,
+    show_default=True,
+    help="Turn the cameras to how the road lies, from heights of the map or of the path.",
+)
 @click.option("--skip-bad-frames", is_flag=True, help="Leave out unreadable frames, count them.")
 @options.threads
 @options.overwrite
@@ -57,6 +63,7 @@ def command(
     batch: int,
     max_frames: int | None,
     every: int,
+    level: bool,
     skip_bad_frames: bool,
     threads: int | None,
     overwrite: bool,
@@ -101,6 +108,7 @@ def command(
         skip_bad_frames=skip_bad_frames,
         max_frames=max_frames,
         every=every,
+        level=level,
     )
     started = time.perf_counter()
     total = min(-(-len(source) // every), max_frames or len(source))

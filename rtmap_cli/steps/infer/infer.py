@@ -28,6 +28,7 @@ from rtmap_cli.logs.run import (
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.prior import PriorSlots, on_prior, prior_slots
+from rtmap_cli.steps.infer.duplicates import fade_duplicates
 from rtmap_cli.steps.infer.images import FittedCamera
 from rtmap_cli.steps.infer.levelling import RoadUnder
 from rtmap_cli.steps.infer.model import MapModel
@@ -250,7 +251,8 @@ def _observations(
 ) -> Observations:
     """The observations of frame ``k`` of a batch: prior queries first, then new ones by score.
 
-    A new query that lies on a matched prior element of its class found that element again.
+    A new query that lies on a matched prior element of its class found that element again; one that
+    lies on a better new one fades.
     """
     names = np.array(model.info.classes, dtype=object)
     p, v = len(slots), model.info.vertex_count
@@ -258,6 +260,7 @@ def _observations(
     new_scores = out["scores"][k, :first_prior]
     best = new_scores.argmax(axis=1)
     score = new_scores[np.arange(first_prior), best]
+    score = fade_duplicates(out["points"][k, :first_prior], best, score)
     existence = out["prior_score"][k, :p]
     answered = existence >= options.existence_threshold
     lines = out["points"][k, first_prior : first_prior + p]
