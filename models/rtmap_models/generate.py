@@ -10,26 +10,26 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.cameras import projection
+from rtmap_cli.geometry.cameras import fit_plane, projection
 from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.logs.log import Rig
 from rtmap_cli.maps.crop import MapIndex
-from rtmap_cli.steps.simulate.images.render import render_cameras
+from rtmap_cli.steps.simulate.images.render import body_motion, render_cameras
 from rtmap_cli.steps.simulate.images.style import make_style
 from rtmap_cli.steps.simulate.towns.town import Town, make_town
+from rtmap_cli.steps.simulate.worlds.heights import Ground, stand_on
 from rtmap_cli.steps.simulate.worlds.world import world_from_map
 from rtmap_cli.steps.simulate.worlds.world_objects import random_occluders
 from rtmap_models.config import ModelConfig
 from rtmap_models.rigs import sample_rig
 from rtmap_models.samples import Array
-from rtmap_models.shards import write_shard
-from rtmap_models.views import View, scene_at, wide_picture, wide_warp
+from rtmap_models.views import Pictures, View, scene_at
 
 FRAMES_PER_TOWN = 24
 TOWN_SIZES = (150.0, 220.0, 320.0)
@@ -44,10 +44,23 @@ def town_views(config: ModelConfig, seed: int, count: int) -> Iterator[View]:
     index = MapIndex(town.vector_map, join=True)
     rig, style = sample_rig(config, rng), make_style(rng)
     for _ in range(count):
-        pose = random_pose(town, rng)
+        pose = stand_on(world.ground, random_pose(town, rng))
         occluders = random_occluders(world, pose, rng, float(rng.choice([0.0, 3.0, 7.0])))
-        images = render_cameras(world, pose, rig.cameras, style, occluders, rng)
-        yield View(np.stack(images), projections(rig), scene_at(index, pose, config), pose)
+        body = body_motion(style, rng)
+        images = render_cameras(world, pose, rig.cameras, style, occluders, rng, body=body)
+        scene, plane = scene_at(index, pose, config), road_plane(world.ground, pose, body)
+        yield View(np.stack(images), projections(rig), scene, pose, plane)
+
+
+def road_plane(ground: Ground | None, pose: Array, body: Array) -> Array:
+    """(3,) how the road lies around a vehicle that stands at ``pose`` (on the ground, the z of
+    its ego frame on the road) and moves on its springs by ``body``; see `fit_plane`."""
+    x, y = np.meshgrid(np.arange(-30.0, 31.0, 5.0), np.arange(-15.0, 16.0, 5.0))
+    flat = np.stack([x, y, np.zeros_like(x), np.ones_like(x)], axis=-1).reshape(-1, 4)
+    points = flat @ pose.T
+    if ground is not None:
+        points[:, 2] = ground.at(points[:, :2])
+    return fit_plane((points @ np.linalg.inv(pose @ body).T)[:, :3])
 
 
 def projections(rig: Rig) -> NDArray[np.float32]:
@@ -129,16 +142,9 @@ def make_town_shard(job: TownJob) -> str:
     config = job.config
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     torch.set_num_threads(1)
-    warp = wide_warp(config)
-    pictures, views = [], []
+    pictures = Pictures(config, np.random.default_rng([job.seed, 0x706C616E]), job.keep_images)
     for view in town_views(config, job.seed, job.frames):
-        pictures.append(wide_picture(warp, view.images, view.ego_to_image))
-        views.append(view)
-    kept: dict[str, Any] = {}
-    if job.keep_images:
-        kept["images"] = np.stack([v.images for v in views])
-        kept["ego_to_image"] = np.stack([v.ego_to_image for v in views])
-    scenes = [v.scene for v in views]
+        pictures.add(view)
     name = town_name(job.seed)
-    write_shard(job.folder, name, np.stack(pictures), scenes, {"town": job.seed}, **kept)
+    pictures.write(job.folder, name, {"town": job.seed})
     return name

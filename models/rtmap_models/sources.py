@@ -13,7 +13,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -31,8 +31,7 @@ from rtmap_cli.steps.infer.images import FittedCamera
 from rtmap_cli.tables import whole_folder
 from rtmap_models.config import ModelConfig
 from rtmap_models.samples import Array
-from rtmap_models.shards import write_shard
-from rtmap_models.views import View, scene_at, wide_picture, wide_warp
+from rtmap_models.views import Pictures, View, scene_at
 
 SHARD_FRAMES = 24
 
@@ -172,18 +171,13 @@ def make_frames(job: LogJob) -> int:
     """Turn one log into shards of frames; returns their count."""
     log = open_log(job.spec)
     index = MapIndex(_truth(job, log), join=True)
-    warp = wide_warp(job.config)
     with whole_folder(job.folder) as folder:
         count = 0
         for number, views in enumerate(_chunks(log_views(log, index, job), SHARD_FRAMES)):
-            kept: dict[str, Any] = {}
-            if job.keep_images:
-                kept["images"] = np.stack([v.images for v in views])
-                kept["ego_to_image"] = np.stack([v.ego_to_image for v in views])
-            pictures = np.stack([wide_picture(warp, v.images, v.ego_to_image) for v in views])
-            scenes = [v.scene for v in views]
-            info = {"log": log.log_id}
-            write_shard(folder, f"frames-{number:05d}", pictures, scenes, info, **kept)
+            pictures = Pictures(job.config, np.random.default_rng(number), job.keep_images)
+            for view in views:
+                pictures.add(view)
+            pictures.write(folder, f"frames-{number:05d}", {"log": log.log_id})
             count += len(views)
         if not count:
             raise BadInput(log.path, "no frame has images", "train on a log with images")

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.cameras import levelled
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_models.bev import BevWarp
 from rtmap_models.config import ModelConfig
 from rtmap_models.samples import Array, Scene
-from rtmap_models.shards import SCENE_MARGIN_M, window_half, window_size
+from rtmap_models.shards import SCENE_MARGIN_M, window_half, window_size, write_shard
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,7 @@ class View:
     ego_to_image: NDArray[np.float32]
     scene: Scene
     map_SE3_ego: Array
+    plane: Array | None = None  # (3,) the road z = a x + b y + c in the ego frame, where known
 
 
 def scene_at(index: MapIndex, pose: Array, config: ModelConfig) -> Scene:
@@ -44,9 +48,41 @@ def wide_warp(config: ModelConfig) -> BevWarp:
 
 
 @torch.no_grad()
-def wide_picture(
-    warp: BevWarp, images: NDArray[np.uint8], ego_to_image: NDArray[np.float32]
-) -> NDArray[np.uint8]:
-    """(rows, columns, 4) bird's-eye picture of (N, H, W, 3) images."""
-    picture = warp(torch.from_numpy(images)[None], torch.from_numpy(ego_to_image)[None])[0]
+def wide_picture(warp: BevWarp, view: View) -> NDArray[np.uint8]:
+    """(rows, columns, 4) bird's-eye picture of a view."""
+    images, projections = (torch.from_numpy(x)[None] for x in (view.images, view.ego_to_image))
+    picture = warp(images, projections)[0]
     return picture.round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+
+
+LEFT_PLANE = np.array([0.0025, 0.0025, 0.015])
+"""Standard deviations of what stays wrong after levelling: slopes along x and y, metres."""
+
+
+class Pictures:
+    """Collects views and writes them as a shard of training frames.
+
+    Where a view's plane is known its picture is levelled but for `LEFT_PLANE`.
+    """
+
+    def __init__(self, config: ModelConfig, rng: np.random.Generator, keep_images: bool):
+        self.warp, self.rng, self.keep_images = wide_warp(config), rng, keep_images
+        self.views: list[View] = []
+        self.pictures: list[NDArray[np.uint8]] = []
+
+    def add(self, view: View) -> None:
+        """Make the picture of one more view."""
+        if view.plane is not None:
+            plane = view.plane + self.rng.normal(0.0, 1.0, 3) * LEFT_PLANE
+            view = replace(view, ego_to_image=levelled(view.ego_to_image, plane).astype("f4"))
+        self.views.append(view)
+        self.pictures.append(wide_picture(self.warp, view))
+
+    def write(self, folder: Path, name: str, info: dict[str, Any]) -> None:
+        """Write the shard ``name``."""
+        kept: dict[str, Any] = {}
+        if self.keep_images:
+            kept["images"] = np.stack([v.images for v in self.views])
+            kept["ego_to_image"] = np.stack([v.ego_to_image for v in self.views])
+        scenes = [v.scene for v in self.views]
+        write_shard(folder, name, np.stack(self.pictures), scenes, info, **kept)
