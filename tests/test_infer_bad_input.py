@@ -109,6 +109,16 @@ def test_fisheye_and_rational_lenses_are_read(infer: Call, tmp_path: Path) -> No
     assert list(read_run(tmp_path / "run").frames.camera_count) == [3, 3, 3]
 
 
+def test_lenses_that_are_not_simulated_are_named(rtmap: Call, tmp_path: Path) -> None:
+    k = small_rig(1).cameras[0].intrinsics
+    fish = Camera("fish", 64, 48, k, FORWARD, (0.02, 0.0, 0.0, 0.0), "fisheye")
+    log = write_log(tmp_path / "log", Rig((fish,)))
+    town = _map(tmp_path / "map", [np.array([[0.0, 1.0], [20.0, 1.0]])])
+    command = ("simulate", "images", "--map", town, "--log", log, "--quiet", "-o", tmp_path / "out")
+    told = _one_line(rtmap(*command, code=3))
+    assert "fish" in told and "--rig default" in told
+
+
 def test_more_prior_elements_than_slots(infer: Call, log: Path, tmp_path: Path) -> None:
     slots = MapModel("rtmap-tiny", 1).info.prior_slots
     y = np.linspace(0.5, 17.5, slots + 7)

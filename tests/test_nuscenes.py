@@ -145,6 +145,14 @@ def test_the_map_expansion_becomes_a_map(rtmap: Call, folder: Path, tmp_path: Pa
     (island,) = [e for e in rings if e is not outline]
     assert shapely.Polygon(island.xy).area == pytest.approx(20)
     assert not shapely.Polygon(island.xy).exterior.is_ccw
+    again = tmp_path / "again"
+    rtmap("import", "nuscenes", folder / "v1.0-mini", "-o", again)
+    assert read_map(again).by_id().keys() == found.keys()
+    rtmap("map", "validate", tmp_path / "map")
+    rtmap("export", "geojson", tmp_path / "map", "-o", tmp_path / "map.geojson")
+    rtmap("import", "geojson", tmp_path / "map.geojson", "-o", tmp_path / "back")
+    back = read_map(tmp_path / "back").by_id()["divider-ld-a"]
+    np.testing.assert_allclose(back.xy, found["divider-ld-a"].xy, atol=1e-3)
     # Map and log share a frame: the map is a prior of the scene.
     rtmap(
         "infer",

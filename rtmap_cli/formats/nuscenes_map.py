@@ -53,9 +53,9 @@ def find_expansion(folder: Path, location: str | None) -> Path:
     """The file of a location (the only one without a name) under a nuScenes folder."""
     if not folder.is_dir():
         raise BadInput(folder, "no such folder", "give the folder that holds maps/expansion")
-    places = [
-        p for p in (folder / "maps" / "expansion", folder / "expansion", folder) if p.is_dir()
-    ]
+    # Also where the folder of the tables was given, and where the maps lie alone.
+    inside = ("maps/expansion", "../maps/expansion", "expansion", ".")
+    places = [folder / name for name in inside if (folder / name).is_dir()]
     found = {p.stem: p for place in reversed(places) for p in sorted(place.glob("*-*.json"))}
     known = ", ".join(sorted(found)) or "none"
     if location is None and len(found) == 1:

@@ -58,6 +58,9 @@ class Tables:
         self._of_sample: dict[str, list[Record]] = {}
         for record in self.sample_data.values():
             self._of_sample.setdefault(str(record.get("sample_token")), []).append(record)
+        self._of_scene: dict[str, list[Record]] = {}
+        for record in self.sample.values():
+            self._of_scene.setdefault(str(record.get("scene_token")), []).append(record)
 
     def path(self, table: str) -> Path:
         """The file of a table."""
@@ -82,8 +85,7 @@ class Tables:
 
     def samples_of(self, scene: Record) -> list[Record]:
         """The samples of a scene in time order."""
-        token = scene["token"]
-        found = [r for r in self.sample.values() if r.get("scene_token") == token]
+        found = self._of_scene.get(str(scene["token"]), [])
         return sorted(found, key=lambda r: int(self.field("sample", r, "timestamp")))
 
     def data_of(self, sample: Record) -> dict[str, Record]:
