@@ -224,6 +224,7 @@ def _write(
     from rtmap_cli.steps.simulate.images.drive_images import (
         frames_of,
         images_of,
+        on_springs,
         poses_of,
         with_vehicles,
     )
@@ -231,10 +232,10 @@ def _write(
 
     vector_map, world_map, truth = maps
     world = world_from_map(world_map, key.world_seed, surface_map=vector_map if truth else None)
-    path = with_vehicles(path, source, world.surface, key, traffic)
+    path = on_springs(with_vehicles(path, source, world.surface, key, traffic), source, key)
     name = f"{path.name}-images-w{key.world_seed}-s{key.seed}-d{key.traversal}"
     writer = NativeLogWriter(folder, name, path.crs, rig, source.ground_z, creation=said)
-    pictures = images_of(world, path, rig, source.ground_z, key, quality)
+    pictures = images_of(world, path, rig, source, key, quality)
     shown = progress(pictures, "frames", len(path), quiet)
     for frame, images in zip(frames_of(path, key), shown, strict=True):
         writer.add(frame, images)

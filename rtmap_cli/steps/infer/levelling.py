@@ -33,7 +33,8 @@ PLACE_SIGMA_M = 0.06
 """How well one place follows the plane, metres."""
 
 SLOPE_SIGMA = 0.03
-"""How much slopes vary that nothing measures (across a path, say): the weight of level ground."""
+"""How much slopes vary that nothing measures (across a path, say): the weight of ground that is
+level in the map frame (roads lean less against that than vehicles against their roads)."""
 
 STEEPEST = 0.2
 """Slopes beyond this are errors of poses, not roads; the frame is left as it is."""
@@ -64,14 +65,16 @@ class RoadUnder:
             if tree is self.known_tree and len(near) < MIN_POINTS:
                 continue
             local = near @ back[:3, :3].T + back[:3, 3]
-            slopes = _slopes(local, through_origin=tree is self.path_tree)
+            up = map_SE3_ego[2, :3]
+            level = -up[:2] / max(up[2], 0.5)
+            slopes = _slopes(local, level, through_origin=tree is self.path_tree)
             if np.abs(slopes).max() < STEEPEST:
                 return np.array([*slopes, 0.0])
         return np.zeros(3)
 
 
-def _slopes(local: Array, through_origin: bool) -> Array:
-    """(2,) a, b by least squares with level ground as the prior; (n, 3) ego metres.
+def _slopes(local: Array, level: Array, through_origin: bool) -> Array:
+    """(2,) a, b by least squares with ``level`` (2,) ground as the prior; (n, 3) ego metres.
 
     The map's heights and the pose's may have different zeros: unless ``through_origin`` a common
     shift is solved for and forgotten.
@@ -81,7 +84,8 @@ def _slopes(local: Array, through_origin: bool) -> Array:
     weight = 1.0 / (1.0 + (distance / HALF_M) ** 2) / PLACE_SIGMA_M
     ridge = np.diag([SLOPE_SIGMA**-2.0, SLOPE_SIGMA**-2.0, 1e-6])
     rows, z = rows * weight[:, None], local[:, 2] * weight
-    solved: Array = np.linalg.solve(rows.T @ rows + ridge, rows.T @ z)
+    right = rows.T @ z + ridge @ np.append(level, 0.0)
+    solved: Array = np.linalg.solve(rows.T @ rows + ridge, right)
     return solved[:2]
 
 

@@ -7,21 +7,26 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from rtmap_cli.logs.log import Frame, Rig
 from rtmap_cli.logs.run import Poses
 from rtmap_cli.steps.simulate.driving.drive import lane_traffic
 from rtmap_cli.steps.simulate.driving.drives import Drive, initial_poses, with_traffic
-from rtmap_cli.steps.simulate.images.render import render_cameras
+from rtmap_cli.steps.simulate.images.render import body_motion, render_cameras
 from rtmap_cli.steps.simulate.images.style import make_style
 from rtmap_cli.steps.simulate.perceiving.noise import generator
 from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
 from rtmap_cli.steps.simulate.perceiving.presets import Preset
+from rtmap_cli.steps.simulate.worlds.heights import level
 from rtmap_cli.steps.simulate.worlds.world import World
 from rtmap_cli.steps.simulate.worlds.world_ground import opencv
 
 if TYPE_CHECKING:
     from rtmap_cli.steps.simulate.driving.drive_source import Source
+
+Array = NDArray[np.float64]
 
 
 def with_vehicles(
@@ -43,15 +48,41 @@ def with_vehicles(
     return replace(path, occluders=lifted)
 
 
+ATTITUDE_DEG = 0.1
+"""How well a vehicle knows its roll and pitch (standard deviation), as with an inertial unit."""
+
+
+def on_springs(path: Drive, source: Source, key: DriveKey) -> Drive:
+    """The drive as the body makes it: pitch, roll and heave on the springs are part of its poses.
+
+    The poses of a recorded log have them already.
+    """
+    if source.lanes is None:
+        return path
+    style = make_style(generator(*key.drive, "style"))
+    rng = generator(*key.drive, "springs")
+    return replace(path, pose=np.stack([pose @ body_motion(style, rng) for pose in path.pose]))
+
+
+def _leaned(poses: Array, key: DriveKey) -> Array:
+    """Poses whose roll and pitch are known to `ATTITUDE_DEG`."""
+    rng = generator(*key.drive, "attitude")
+    about = np.radians(rng.normal(0.0, ATTITUDE_DEG, (len(poses), 3)) * [1, 1, 0])
+    out = poses.copy()
+    out[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(about).as_matrix()
+    return out
+
+
 def frames_of(path: Drive, key: DriveKey) -> Iterator[Frame]:
     """What the vehicle knows: rough poses with their sigmas, odometry, boxes."""
     known = initial_poses(path, Preset(), key)
+    initial = _leaned(known.initial, key)
     for k in range(len(path)):
         measured = bool(np.isfinite(known.odometry[k]).all())
         yield Frame(
             index=k,
             timestamp_ns=int(path.timestamp_ns[k]),
-            map_SE3_ego=known.initial[k],
+            map_SE3_ego=initial[k],
             sigma=known.sigma[k],
             odometry=known.odometry[k] if measured else None,
             odometry_sigma=known.odometry_sigma[k] if measured else None,
@@ -60,16 +91,23 @@ def frames_of(path: Drive, key: DriveKey) -> Iterator[Frame]:
 
 
 def images_of(
-    world: World, path: Drive, rig: Rig, ground_z: float, key: DriveKey, quality: int
+    world: World, path: Drive, rig: Rig, source: Source, key: DriveKey, quality: int
 ) -> Iterator[dict[str, bytes]]:
-    """JPEG files of every frame by camera name; weather belongs to the drive."""
+    """JPEG files of every frame by camera name; weather belongs to the drive.
+
+    The vehicle leans as its pose says: over flat ground in a town, and over any hills. A recorded
+    pose over a map without heights leans with slopes that are not drawn, and is taken upright.
+    """
     cv2 = opencv()
     style = make_style(generator(*key.drive, "style"))
     parameters = [cv2.IMWRITE_JPEG_QUALITY, quality]
     for k, pose in enumerate(path.pose):
         boxes = path.occluders[k] if path.occluders else ()
         rng = generator(*key.drive, "camera", k)
-        images = render_cameras(world, pose, rig.cameras, style, boxes, rng, ground_z)
+        lean = np.eye(4)
+        if world.ground is None and source.lanes is not None:
+            lean[:3, :3] = level(pose)[:3, :3].T @ pose[:3, :3]
+        images = render_cameras(world, pose, rig.cameras, style, boxes, rng, source.ground_z, lean)
         yield {
             camera.name: cv2.imencode(".jpg", image[..., ::-1], parameters)[1].tobytes()
             for camera, image in zip(rig, images, strict=True)
