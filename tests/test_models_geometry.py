@@ -77,8 +77,23 @@ def test_warp_finds_the_colour_of_the_ground() -> None:
     assert close.sum() > 500
     assert np.abs(out[0] - centres[..., 0] * 8)[close].max() < 6
     assert np.abs(out[1] - 128 - centres[..., 1] * 8)[close].max() < 6
-    expected = np.sqrt(1.5 / np.sqrt((centres**2).sum(-1) + 1.5**2)) * 255
+    blocks = cell_centres(36.0, 18.0, 72, 144).numpy().repeat(2, axis=0).repeat(2, axis=1)
+    expected = np.sqrt(1.5 / np.sqrt((blocks**2).sum(-1) + 1.5**2)) * 255
     assert np.abs(out[3] - expected)[close].max() < 0.5
+
+
+def test_warp_of_odd_sizes_is_cut_from_whole_blocks() -> None:
+    rng = np.random.default_rng(0)
+    e = projection(np.array([[110.0, 0, 111.5], [0, 110, 38.0], [0, 0, 1]]), looking_forward())
+    image = torch.from_numpy(rng.integers(0, 256, (1, 1, 128, 224, 3), dtype=np.uint8))
+    e = torch.tensor(e[None, None]).float()
+    odd = BevWarp(31 / 2, 15 / 2, 15, 31, 2)(image, e)
+    assert odd.shape == (1, 4, 15, 31)
+    # Cells of 1 m whose rows and columns are counted from the same corner.
+    even = BevWarp(32 / 2, 16 / 2, 16, 32, 2)
+    even.centres += 0.5
+    even.ground += 0.5
+    assert torch.allclose(even(image, e)[:, :, :15, :31], odd, atol=1e-2)
 
 
 def test_an_absent_camera_shows_nothing() -> None:

@@ -1,8 +1,9 @@
 """From the cameras to a bird's-eye picture of the road, inside the graph.
 
-The ground is the plane z = 0 of the frame that ``ego_to_image`` projects from. Each cell takes its
-colour from the camera that sees it nearest to the middle of its image; the fourth channel is
-√(camera height / distance), which falls with the quality of the view, and 0 where nothing is seen.
+The ground is the plane z = 0 of the frame that ``ego_to_image`` projects from. Each block of
+cells takes its colour from the camera that sees it nearest to the middle of its image; the fourth
+channel is √(camera height / distance), which falls with the quality of the view, and 0 where
+nothing is seen.
 """
 
 from __future__ import annotations
@@ -42,10 +43,15 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
     return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], dim=-1)
 
 
+BLOCK = 2
+"""Cells side by side that share a camera and a quality, per axis."""
+
+
 class BevWarp(nn.Module):
     """Images of N calibrated cameras → one picture (4 channels, values 0 … 255).
 
-    The camera is chosen per cell; ``supersample``² points of the cell are read and averaged.
+    The camera is chosen per block of `BLOCK`² cells; ``supersample``² points of each cell are read
+    and averaged.
     """
 
     centres: Tensor
@@ -54,13 +60,25 @@ class BevWarp(nn.Module):
     def __init__(self, half_x: float, half_y: float, rows: int, columns: int, supersample: int):
         super().__init__()
         self.rows, self.columns, self.supersample = rows, columns, supersample
-        centres = cell_centres(half_x, half_y, rows, columns).reshape(-1, 2)
-        fine = cell_centres(half_x, half_y, rows * supersample, columns * supersample)
-        self.register_buffer("centres", centres.t().contiguous(), persistent=False)
-        # Points of a cell side by side: (x and y, points per cell, cells).
-        fine = fine.reshape(rows, supersample, columns, supersample, 2).permute(4, 1, 3, 0, 2)
-        ground = fine.reshape(2, supersample * supersample, -1).contiguous()
-        self.register_buffer("ground", ground, persistent=False)
+        self.blocks = -(-rows // BLOCK), -(-columns // BLOCK)
+        count_y, count_x = self.blocks
+        # The last blocks may reach beyond the picture; they are cut off in the end.
+        y, x = (2 * half_y / rows) * BLOCK, (2 * half_x / columns) * BLOCK
+        grid = torch.meshgrid(
+            (torch.arange(count_y) + 0.5) * y - half_y,
+            (torch.arange(count_x) + 0.5) * x - half_x,
+            indexing="ij",
+        )
+        centres = torch.stack(grid[::-1]).reshape(2, -1)
+        self.register_buffer("centres", centres, persistent=False)
+        # (x and y, cells of a block · points of a cell, blocks), so that blocks lie side by side.
+        inside = (torch.arange(BLOCK * supersample) + 0.5) / (BLOCK * supersample) - 0.5
+        shape = (BLOCK, supersample, BLOCK, supersample)
+        dy = (inside * y)[:, None].expand(-1, len(inside)).reshape(shape).transpose(1, 2)
+        dx = (inside * x)[None].expand(len(inside), -1).reshape(shape).transpose(1, 2)
+        offsets = torch.stack([dx.reshape(-1), dy.reshape(-1)])
+        ground = centres[:, None] + offsets[:, :, None]
+        self.register_buffer("ground", ground.contiguous(), persistent=False)
 
     def forward(self, images: Tensor, ego_to_image: Tensor) -> Tensor:
         """``images`` uint8 or float (B, N, H, W, 3), ``ego_to_image`` (B, N, 3, 4).
@@ -71,8 +89,8 @@ class BevWarp(nn.Module):
         """
         batch, cameras, height, width = images.shape[:4]
         e = ego_to_image.float()
-        best, seen = self._choose(e, height, width)  # (B, cells)
-        gx, gy = self._look_up(e, best, height, width)  # (B, points per cell, cells)
+        best, seen = self._choose(e, height, width)  # (B, blocks)
+        gx, gy = self._look_up(e, best, height, width)  # (B, points per block, blocks)
         # All images of a sample stand one over the other, so that one sampling serves them all.
         gy = (best.float()[:, None] + (gy + 1.0) * 0.5) * 2.0 / cameras - 1.0
         atlas = images.float().permute(0, 4, 1, 2, 3).reshape(batch, 3, cameras * height, width)
@@ -82,13 +100,19 @@ class BevWarp(nn.Module):
             mode="bilinear",
             padding_mode="border",
             align_corners=False,
-        ).mean(dim=2)
-        quality = self._quality(e, best)[:, None] * 255.0
-        picture = torch.cat([colour, quality], dim=1) * seen[:, None]
-        return picture.reshape(batch, 4, self.rows, self.columns)
+        )
+        count = self.supersample**2
+        colour = colour.reshape(batch, 3, BLOCK**2, count, -1).mean(dim=3)
+        quality = (self._quality(e, best) * 255.0)[:, None, None].expand(-1, 1, BLOCK**2, -1)
+        picture = torch.cat([colour, quality], dim=1) * seen[:, None, None]
+        rows, columns = self.blocks
+        picture = picture.reshape(batch, 4, BLOCK, BLOCK, rows, columns)
+        picture = picture.permute(0, 1, 4, 2, 5, 3)
+        picture = picture.reshape(batch, 4, BLOCK * rows, BLOCK * columns)
+        return picture[:, :, : self.rows, : self.columns]
 
     def _choose(self, e: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """(B, cells) the camera that sees each cell best, and 1 where one sees it at all."""
+        """(B, blocks) the camera that sees each block best, and 1 where one sees it at all."""
         x, y = self.centres
         u, v, depth = (
             e[:, :, k, 0:1] * x + e[:, :, k, 1:2] * y + e[:, :, k, 3:4] for k in range(3)
@@ -102,7 +126,7 @@ class BevWarp(nn.Module):
         return best, (margin > 0).float()
 
     def _look_up(self, e: Tensor, best: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
-        """(B, points per cell, cells) places in the image of the chosen camera, -1 … 1."""
+        """(B, points per block, blocks) places in the image of the chosen camera, -1 … 1."""
         x, y = self.ground
         rows = []
         for k in range(3):
@@ -116,7 +140,7 @@ class BevWarp(nn.Module):
         return gx.clamp(-1.0, 1.0), gy.clamp(-limit, limit)
 
     def _quality(self, e: Tensor, best: Tensor) -> Tensor:
-        """(B, cells): √(height / distance) of the camera chosen for each cell."""
+        """(B, blocks): √(height / distance) of the camera chosen for each block."""
         centre = camera_centres(e)  # (B, N, 3)
         x, y, height = (centre[..., k].gather(1, best) for k in range(3))
         height = height.clamp(min=0.0)
