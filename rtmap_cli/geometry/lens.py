@@ -1,4 +1,4 @@
-"""Lenses: what bends rays between a camera's axes and its pixels, and its inverse.
+"""Lenses: what bends rays between a camera's axes and its pixels.
 
 Normalised image coordinates are (X / Z, Y / Z) of the camera frame (x right, y down, z forward).
 ``pinhole`` is OpenCV's model: radial k1, k2, k3 or the rational k1 … k6, tangential p1, p2;
@@ -57,19 +57,6 @@ class Lens:
             out = out + self._shifted(xy, r)
         return out
 
-    def undistort(self, xy: Array) -> Array:
-        """(..., 2) coordinates on the image → (..., 2) straight ones; NaN where the lens puts none.
-
-        The radial part is inverted on its rising branch by bisection, the tangential one by
-        fixed-point steps around it (p1, p2 of real lenses are below 0.01).
-        """
-        xy = np.asarray(xy, np.float64)
-        out = self._straightened(xy)
-        for _ in range(20 if any(self.tangential) else 0):
-            r = np.hypot(out[..., 0], out[..., 1])
-            out = self._straightened(xy - self._shifted(out, r))
-        return out
-
     @cached_property
     def reach(self) -> float:
         """Largest straight radius up to which the image radius rises; beyond it the model folds
@@ -104,16 +91,3 @@ class Lens:
         return np.stack(
             [2 * p1 * x * y + p2 * (s + 2 * x * x), p1 * (s + 2 * y * y) + 2 * p2 * x * y], axis=-1
         )
-
-    def _straightened(self, xy: Array) -> Array:
-        """The radial part undone, NaN beyond its reach."""
-        bent = np.hypot(xy[..., 0], xy[..., 1])
-        low, high = np.zeros_like(bent), np.full_like(bent, np.arctan(self.reach))
-        for _ in range(60):
-            middle = (low + high) / 2
-            short = self._bent(np.tan(middle)) < bent
-            low, high = np.where(short, middle, low), np.where(short, high, middle)
-        r = np.tan((low + high) / 2)
-        beyond = ~(bent <= self._bent(np.array(self.reach)))
-        factor = np.divide(r, bent, out=np.ones_like(r), where=bent > 1e-9)
-        return xy * np.where(beyond, np.nan, factor)[..., None]
