@@ -161,19 +161,6 @@ def test_shards_keep_images_for_networks_that_look(
         Frames(tmp_path / "b", seeing)
 
 
-def test_town_frames_keep_images_on_request(rtmap, tiny: Path, seeing: Seeing, tmp_path) -> None:
-    frames = tmp_path / "frames"
-    call = ("--config", tiny, "--frames", 1, "--keep-images", "--threads", 1, "-q")
-    rtmap("train", "-o", tmp_path / "w.pt", *call)
-    shown = Frames(frames, seeing)[0]
-    assert shown.images is not None and shown.ego_to_image is not None
-    assert len(shown.images) == len(shown.ego_to_image) >= 6
-    warp = BevWarp(*window_half(seeing), *window_size(seeing), seeing.supersample)
-    images, projections = (torch.from_numpy(x.copy()) for x in (shown.images, shown.ego_to_image))
-    again = warp(images[None], projections[None])
-    np.testing.assert_allclose(again[0].permute(1, 2, 0).numpy(), shown.picture, atol=0.51)
-
-
 def truth_map(folder: Path) -> Path:
     """A map around the drive of `write_native_log`."""
     x, y = 583_000.0, 4_477_000.0
