@@ -175,8 +175,10 @@ def test_tbv_logs_are_argoverse_logs_without_cuboids(
     run = read_run(tmp_path / "run")
     assert run.log_id == log.name and run.occluders is None
     assert list(run.frames.camera_count) == [2] * 4
-    rtmap("import", "av2", log, "-o", tmp_path / "map")
     assert json.loads(rtmap("check-log", log, "--json").out)["errors"] == 0
+    rtmap("import", "av2", log, "-o", tmp_path / "map")
+    drive = ("--map", tmp_path / "map", "--log", log, "--frames", 1, "--width", 64, "-q")
+    assert "no annotations" in rtmap("simulate", "images", *drive, "-o", tmp_path / "drive").err
 
 
 def test_av2_images_have_their_own_poses(tmp_path: Path) -> None:

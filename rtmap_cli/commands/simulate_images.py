@@ -141,6 +141,8 @@ def command(
     key = DriveKey(world_seed, seed, drive)
     way = Route(route, length, spacing or TOWN_SPACING)
     source = find_source(log_path, map_path, vector_map, key, way)
+    for note in source.notes:
+        log(f"{source.drive.name}: {note}")
     if in_town:
         path = first_frames(source.drive, None, None, frames or 0)
     else:

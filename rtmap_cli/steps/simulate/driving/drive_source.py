@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rtmap_cli.errors import BadInput
 from rtmap_cli.logs.log import Log, Rig
 from rtmap_cli.logs.native import NativeLog
-from rtmap_cli.logs.open import open_log
+from rtmap_cli.logs.open import notes_of, open_log
 from rtmap_cli.maps.crs import check_same_crs
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import history
@@ -32,12 +32,14 @@ IN_RANGE = 40.0
 
 @dataclass(frozen=True)
 class Source:
-    """A drive with what belongs to it: the rig (None: unknown) and, in a town, the lanes."""
+    """A drive with what belongs to it: the rig (None: unknown) and, in a town, the lanes;
+    ``notes`` says what a log lacks."""
 
     drive: Drive
     rig: Rig | None
     ground_z: float
     lanes: list[Lane] | None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def find_source(
     check_same_crs(vector_map.crs, log.crs, map_path)
     drive = drive_of_log(log, _truth(log), 0.0)
     check_range(vector_map, drive.pose[:, :2, 3], map_path, spec)
-    return Source(drive, log.rig, log.ground_z, None)
+    return Source(drive, log.rig, log.ground_z, None, tuple(notes_of(log)))
 
 
 def _truth(log: Log) -> Any:
