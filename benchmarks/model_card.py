@@ -1,7 +1,10 @@
 """Every figure of a model's card: unseen towns, a real map, latency.
 
     python benchmarks/model_card.py models/rtmap_models/zoo/rtmap-tiny.onnx \\
-        --av2 "$RTMAP_DATA/av2_sensor/7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
+        --av2 "$RTMAP_DATA"/av2_sensor/7fab2350-* "$RTMAP_DATA"/av2_sensor/adcf7d18-*
+
+A log without calibration borrows the rig of the first. Real maps are drawn twice: flat, and with
+their heights.
 
 Needs the extras ``train`` and ``simulate`` (torch only because the frames come from the package
 that trains). Images are rendered; the model runs in onnxruntime from images to answers.
@@ -12,30 +15,20 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rtmap_models.config import ModelConfig, load_config
-from rtmap_models.generate import View, projections, scene_at, town_views
 from rtmap_models.samples import Pieces, Prior, PriorNoise, clip, make_prior
+from scenes import RealMap, Shot, unseen_towns
 from scipy.stats import spearmanr
 
-from rtmap_cli.formats.av2 import Av2Log, read_av2_map
-from rtmap_cli.geometry.cameras import fit_camera
-from rtmap_cli.logs.log import Rig
-from rtmap_cli.maps.crop import MapIndex
+from rtmap_cli.maps.prior import on_prior
 from rtmap_cli.steps.evaluate.precision import Scorer
+from rtmap_cli.steps.infer.duplicates import fade_duplicates
 from rtmap_cli.steps.infer.model import MapModel
-from rtmap_cli.steps.simulate.images.render import render_cameras
-from rtmap_cli.steps.simulate.images.style import make_style
-from rtmap_cli.steps.simulate.worlds.world import world_from_map
-
-TEST_SEED = 90_000_000
-"""Towns from this seed on are neither trained nor calibrated with."""
 
 PRIORS: dict[str, PriorNoise | None] = {
     "without prior": None,
@@ -45,56 +38,19 @@ PRIORS: dict[str, PriorNoise | None] = {
 }
 
 
-def unseen_towns(config: ModelConfig, towns: int, frames: int) -> Iterator[View]:
-    """Frames of towns that training never drew."""
-    for k in range(towns):
-        yield from town_views(config, TEST_SEED + k, frames)
-
-
-def real_map(config: ModelConfig, log_path: Path, frames: int) -> Iterator[View]:
-    """Simulated images over the map of an Argoverse 2 log, its rig, its poses, its cuboids."""
-    log, rng = Av2Log(log_path), np.random.default_rng(0)
-    vector_map = read_av2_map(log_path)
-    world, index = world_from_map(vector_map, 0), MapIndex(vector_map, join=True)
-    style = make_style(rng)
-    if log.rig is None:
-        raise SystemExit(f"{log_path}: the log has no calibration")
-    rig = Rig(tuple(_fitted(c, config, log.ground_z) for c in log.rig))
-    drop = np.eye(4)
-    drop[2, 3] = log.ground_z
-    chosen = set(np.linspace(0, len(log) - 1, frames).round().astype(int).tolist())
-    for k, frame in enumerate(log.frames()):
-        if k not in chosen:
-            continue
-        pose = frame.map_SE3_ego @ drop
-        boxes = tuple(replace(o, z=o.z - log.ground_z) for o in frame.occluders)
-        images = render_cameras(world, pose, rig.cameras, style, boxes, rng)
-        yield View(np.stack(images), projections(rig), scene_at(index, pose, config), pose)
-
-
-def _fitted(camera: Any, config: ModelConfig, ground_z: float) -> Any:
-    """The camera at the model's image size, in the frame dropped to the road, undistorted."""
-    pose = camera.ego_SE3_camera.copy()
-    pose[2, 3] -= ground_z
-    size = (camera.height, camera.width)
-    _, k = fit_camera(camera.intrinsics, pose, size, config.image_size, config.horizon)
-    height, width = config.image_size
-    return replace(
-        camera,
-        width=width,
-        height=height,
-        intrinsics=k,
-        ego_SE3_camera=pose,
-        distortion=(0.0, 0.0, 0.0),
-    )
-
-
 def detections(
     out: dict[str, NDArray[Any]], config: ModelConfig, floor: float = 0.02
 ) -> list[tuple[str, NDArray[np.float64], float]]:
-    """Class, vertices and score of every query that says something."""
+    """Class, vertices and score of every query that says something, as ``rtmap infer`` reports."""
     scores, points = out["scores"][0], out["points"][0]
     best = scores.argmax(axis=1)
+    count = len(scores) - len(out["prior_score"][0])
+    scores = scores.copy()
+    top = np.arange(count), best[:count]
+    scores[top] = fade_duplicates(points[:count], best[:count], scores[top])
+    answered = count + np.flatnonzero(out["prior_score"][0] >= 0.5)
+    twice = on_prior(points[:count], best[:count], points[answered], best[answered])
+    scores[:count][twice] = 0.0
     return [
         (config.classes[c], p.astype(np.float64), float(s[c]))
         for s, p, c in zip(scores, points, best, strict=True)
@@ -102,18 +58,19 @@ def detections(
     ]
 
 
-def run(model: MapModel, config: ModelConfig, view: View, prior: Prior | None) -> dict[str, Any]:
-    """One frame through onnxruntime."""
+def run(model: MapModel, config: ModelConfig, shot: Shot, prior: Prior | None) -> dict[str, Any]:
+    """One frame through onnxruntime, levelled as ``rtmap infer`` does."""
     slots = max(1, len(prior.classes) if prior else 0)
     points = np.zeros((1, slots, config.vertex_count, 2), np.float32)
     class_id, mask = np.zeros((1, slots), np.int64), np.zeros((1, slots), np.float32)
     if prior is not None and len(prior.classes):
         points[0], class_id[0], mask[0] = prior.points, prior.classes, 1.0
-    return model(view.images[None], view.ego_to_image[None], points, class_id, mask)
+    cameras = shot.cameras(None if prior is None else prior.delta)
+    return model(shot.view.images[None], cameras[None], points, class_id, mask)
 
 
 def measure(
-    model: MapModel, config: ModelConfig, views: list[View], noise: PriorNoise | None
+    model: MapModel, config: ModelConfig, shots: list[Shot], noise: PriorNoise | None
 ) -> dict[str, Any]:
     """All figures of one set of frames with one kind of prior."""
     rng = np.random.default_rng(1)
@@ -121,12 +78,13 @@ def measure(
     exist: list[tuple[float, bool]] = []
     pose: list[NDArray[np.float64]] = []
     spread: list[NDArray[np.float64]] = []
-    for view in views:
+    for shot in shots:
+        view = shot.view
         truth = clip(view.scene, config, min_length=0.5)
         prior = None
         if noise is not None:
             prior = make_prior(view.scene, clip(view.scene, config), config, noise, rng)
-        out = run(model, config, view, prior)
+        out = run(model, config, shot, prior)
         true = _detections_of(truth.points, truth.classes, config)
         scorer.add(detections(out, config), true)
         if prior is None:
@@ -237,21 +195,16 @@ def _pose_figures(pose: NDArray[np.float64]) -> dict[str, list[float]]:
     }
 
 
-def latency(path: Path, config: ModelConfig, view: View) -> dict[str, dict[str, float]]:
+def latency(path: Path, config: ModelConfig, shot: Shot) -> dict[str, dict[str, float]]:
     """Milliseconds per frame, one frame at a time, by threads."""
-    prior = make_prior(
-        view.scene,
-        clip(view.scene, config),
-        config,
-        PriorNoise(1.0, 1.0, 0.0, 0.0, 0.0),
-        np.random.default_rng(0),
-    )
+    scene, noise = shot.view.scene, PriorNoise(1.0, 1.0, 0.0, 0.0, 0.0)
+    prior = make_prior(scene, clip(scene, config), config, noise, np.random.default_rng(0))
     out = {}
     for threads in (1, 2):
         model, times = MapModel(str(path), threads), []
         for _ in range(40):
             start = time.perf_counter()
-            run(model, config, view, prior)
+            run(model, config, shot, prior)
             times.append((time.perf_counter() - start) * 1e3)
         ms = np.array(times[5:])
         out[f"{threads} threads"] = {
@@ -268,13 +221,16 @@ def main() -> None:
     parser.add_argument("--config", default="rtmap-tiny")
     parser.add_argument("--towns", type=int, default=40)
     parser.add_argument("--frames", type=int, default=6, help="per town")
-    parser.add_argument("--av2", type=Path, help="log for the out-of-domain test")
-    parser.add_argument("--av2-frames", type=int, default=64)
+    parser.add_argument("--av2", type=Path, nargs="+", default=[], help="logs with real maps")
+    parser.add_argument("--av2-frames", type=int, default=32, help="per log and kind of place")
     a = parser.parse_args()
     config, model = load_config(a.config), MapModel(str(a.model))
     sets = {"unseen towns": list(unseen_towns(config, a.towns, a.frames))}
-    if a.av2:
-        sets["real map"] = list(real_map(config, a.av2, a.av2_frames))
+    for ground in ("flat", "hills") if a.av2 else ():
+        worlds = [RealMap(config, folder, a.av2[0], ground == "flat") for folder in a.av2]
+        for kind in ("drive", "random_places"):
+            shots = [shot for w in worlds for shot in getattr(w, kind)(a.av2_frames)]
+            sets[f"{kind.replace('_', ' ')} over real maps, {ground}"] = shots
     report: dict[str, Any] = {"model": model.info.name, "sha256": model.info.sha256}
     for name, views in sets.items():
         report[name] = {"frames": len(views)}

@@ -36,20 +36,40 @@ TOWN_SIZES = (150.0, 220.0, 320.0)
 TOWNS_PER_SEED = 100_000
 
 
+class TownStage:
+    """A town with one rig and one style, all from ``seed``; ``lanes`` (n, 2) are its lane centres.
+
+    ``look`` draws from the generator that the town was made with, so that a stage's views follow
+    from its seed and their order.
+    """
+
+    def __init__(self, config: ModelConfig, seed: int):
+        self.config = config
+        self.rng = rng = np.random.default_rng([seed, 0x746F776E])
+        self.town = make_town(seed, TOWN_SIZES[rng.choice(3, p=[0.5, 0.3, 0.2])])
+        self.lanes = self.town.lanes
+        self.world = world_from_map(self.town.vector_map, seed)
+        self.index = MapIndex(self.town.vector_map, join=True)
+        self.rig, self.style = sample_rig(config, rng), make_style(rng)
+
+    def look(self) -> View:
+        """What the cameras see at one more random place; the view's pose leans on its springs."""
+        rng, ground = self.rng, self.world.ground
+        pose = stand_on(ground, random_pose(self.town, rng))
+        occluders = random_occluders(self.world, pose, rng, float(rng.choice([0.0, 3.0, 7.0])))
+        body = body_motion(self.style, rng)
+        images = render_cameras(
+            self.world, pose, self.rig.cameras, self.style, occluders, rng, body=body
+        )
+        scene, plane = scene_at(self.index, pose, self.config), road_plane(ground, pose, body)
+        return View(np.stack(images), projections(self.rig), scene, pose @ body, plane)
+
+
 def town_views(config: ModelConfig, seed: int, count: int) -> Iterator[View]:
     """Frames of one town, one rig, one style: all from ``seed``."""
-    rng = np.random.default_rng([seed, 0x746F776E])
-    town = make_town(seed, TOWN_SIZES[rng.choice(3, p=[0.5, 0.3, 0.2])])
-    world = world_from_map(town.vector_map, seed)
-    index = MapIndex(town.vector_map, join=True)
-    rig, style = sample_rig(config, rng), make_style(rng)
+    stage = TownStage(config, seed)
     for _ in range(count):
-        pose = stand_on(world.ground, random_pose(town, rng))
-        occluders = random_occluders(world, pose, rng, float(rng.choice([0.0, 3.0, 7.0])))
-        body = body_motion(style, rng)
-        images = render_cameras(world, pose, rig.cameras, style, occluders, rng, body=body)
-        scene, plane = scene_at(index, pose, config), road_plane(world.ground, pose, body)
-        yield View(np.stack(images), projections(rig), scene, pose, plane)
+        yield stage.look()
 
 
 def road_plane(ground: Ground | None, pose: Array, body: Array) -> Array:

@@ -226,6 +226,7 @@ class Trainer:
             "average": self.average.state_dict(),
             "step": self.step,
             "samples": self.samples,
+            "seconds": self.seconds(),
             "frames": len(self.feed.frames),
             "options": self.options.summary(),
         }
@@ -235,7 +236,6 @@ class Trainer:
         content = self._average_content() | {
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "seconds": self.seconds(),
             "best": self.best,
         }
         save_checkpoint(self.options.output, self.config, content)
