@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
+from rtmap_cli.geometry.cameras import levelled
 from rtmap_cli.logs.log import Frame, Log
 from rtmap_cli.logs.open import log_format, open_log
 from rtmap_cli.maps.crop import MapIndex
@@ -28,6 +29,7 @@ from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import read_map
 from rtmap_cli.steps.infer.checks import check_prior_in_range
 from rtmap_cli.steps.infer.images import FittedCamera
+from rtmap_cli.steps.infer.levelling import RoadUnder
 from rtmap_cli.tables import whole_folder
 from rtmap_models.config import ModelConfig
 from rtmap_models.samples import Array
@@ -170,10 +172,10 @@ def _make(job: LogJob) -> Outcome:
 def make_frames(job: LogJob) -> int:
     """Turn one log into shards of frames; returns their count."""
     log = open_log(job.spec)
-    index = MapIndex(_truth(job, log), join=True)
+    truth = _truth(job, log)
     with whole_folder(job.folder) as folder:
         count = 0
-        for number, views in enumerate(_chunks(log_views(log, index, job), SHARD_FRAMES)):
+        for number, views in enumerate(_chunks(log_views(log, truth, job), SHARD_FRAMES)):
             pictures = Pictures(job.config, np.random.default_rng(number), job.keep_images)
             for view in views:
                 pictures.add(view)
@@ -184,24 +186,28 @@ def make_frames(job: LogJob) -> int:
     return count
 
 
-def log_views(log: Log, index: MapIndex, job: LogJob) -> Iterator[View]:
-    """The frames of a log at their true poses; an absent camera is zero in both arrays."""
-    config = job.config
+def log_views(log: Log, truth: VectorMap, job: LogJob) -> Iterator[View]:
+    """The frames of a log at their true poses, levelled as ``infer`` levels them; an absent camera
+    is zero in both arrays."""
+    config, index = job.config, MapIndex(truth, join=True)
     if log.rig is None:
         raise BadInput(log.path, "the log has no camera calibration", "training needs one")
     cameras = {
         c.name: FittedCamera(c, config.image_size, config.horizon, log.ground_z) for c in log.rig
     }
     true = _true_poses(log)
+    poses = {f.index: f.map_SE3_ego for f in log.frames()} if true is None else true
+    road = RoadUnder(list(poses.values()), truth)
     last: Array | None = None
     for frame in log.frames():
-        pose = frame.map_SE3_ego if true is None else true.get(frame.index)
+        pose = poses.get(frame.index)
         if pose is None or not any(name in frame.images for name in cameras):
             continue
         if last is not None and np.hypot(*(pose[:2, 3] - last)) < job.spacing_m:
             continue
         last = pose[:2, 3]
         images, projections = _cameras_of(frame, cameras, config)
+        projections = levelled(projections, road.plane(pose)).astype(np.float32)
         yield View(images, projections, scene_at(index, pose, config), pose)
 
 
@@ -245,8 +251,7 @@ def _truth(job: LogJob, log: Log) -> VectorMap:
     if kind == "nuscenes" and location is not None:
         from rtmap_cli.formats.nuscenes_map import read_nuscenes_map
 
-        folder = log.path if (log.path / "maps").is_dir() else log.path.resolve().parent
-        return read_nuscenes_map(folder, location)
+        return read_nuscenes_map(log.path, location)
     raise BadInput(log.path, "the log brings no map of its own", "pass --map with the true map")
 
 
