@@ -37,7 +37,7 @@ from rtmap_cli import options
 @click.option(
     "--seed",
     type=click.IntRange(0),
-    default=2014,
+    default=2016,
     show_default=True,
     help="Seed of town and drives.",
 )

@@ -54,6 +54,9 @@ def make_style(rng: np.random.Generator) -> Style:
         return (r, g, b)
 
     asphalt = grey(50, 125)
+    wet = rng.random() < 0.12
+    if wet:
+        asphalt *= 0.7
     level = float(asphalt.mean())
     green = np.array([rng.uniform(50, 120), rng.uniform(75, 130), rng.uniform(30, 80)])
     verge = green if rng.random() < 0.55 else grey(75, 165, 0.05)
@@ -71,15 +74,26 @@ def make_style(rng: np.random.Generator) -> Style:
         curb=colour(grey(125, 215, 0.02)),
         white=colour(white),
         yellow=colour(yellow),
-        grain=float(rng.uniform(0.4, 1.4)),
+        grain=float(rng.uniform(0.2, 0.6) if wet else rng.uniform(0.4, 1.5)),
         haze=colour(haze),
         sky=colour(sky),
         visibility=float(rng.choice([120.0, 250.0, 500.0]) * rng.uniform(0.7, 1.3)),
-        gain=colour(rng.uniform(0.7, 1.25) * np.exp(rng.normal(0, 0.04, 3))),
-        gamma=float(rng.uniform(0.8, 1.25)),
+        gain=colour(_exposure(rng) * _white_balance(rng)),
+        gamma=float(rng.uniform(0.75, 1.35)),
         sun=float(rng.uniform(0, 2 * np.pi)),
         contrast=float(rng.uniform(0.05, 0.35)),
-        blur=float(rng.uniform(0.3, 0.8)) if rng.random() < 0.35 else 0.0,
-        noise=float(rng.uniform(1, 7)),
+        blur=float(rng.uniform(0.3, 1.0)) if rng.random() < 0.4 else 0.0,
+        noise=float(rng.uniform(1, 7) if rng.random() < 0.85 else rng.uniform(7, 13)),
         seed=int(rng.integers(2**31)),
     )
+
+
+def _exposure(rng: np.random.Generator) -> float:
+    """Brightness of all cameras; one drive of five is clearly too dark or too bright."""
+    return float(rng.uniform(0.7, 1.25) if rng.random() < 0.8 else rng.choice([0.5, 1.45]))
+
+
+def _white_balance(rng: np.random.Generator) -> NDArray[np.float64]:
+    """(3,) gains of red, green and blue: a colour temperature and a small tint."""
+    warm = rng.normal(0, 0.07)
+    return np.exp(np.array([warm, 0.0, -warm]) + rng.normal(0, 0.03, 3))

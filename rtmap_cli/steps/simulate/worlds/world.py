@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from rtmap_cli.geometry.polylines import arc_length, is_ring, join_lines, normals, resample_step
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.steps.simulate.worlds.heights import Ground, ground_of
+from rtmap_cli.steps.simulate.worlds.markings import arrows, rng_of, seams, stop_lines
 from rtmap_cli.steps.simulate.worlds.world_objects import roadside
 
 Array = NDArray[np.float64]
@@ -36,7 +36,8 @@ class World:
     ``surface``: the asphalt; ``curbs``: lines (n, 2) with a curb; ``soft``: asphalt edges where the
     curb is gone (the ground beside them is paved too). ``seed`` fixes the wear of paint, which
     is a field over the map frame: the same place looks the same in every drive. ``tiles`` caches
-    the rasterised ground. ``ground`` holds the heights, None over a flat map.
+    the rasterised ground. ``ground`` holds the heights, None over a flat map; ``tar``
+    are seams of tar, dark lines (n, 2).
     """
 
     vector_map: VectorMap
@@ -49,6 +50,7 @@ class World:
     tiles: dict[tuple[float, int, int], Any] = field(default_factory=dict, repr=False)
     boxes: dict[str, Array] = field(default_factory=dict, repr=False)
     ground: Ground | None = None
+    tar: list[Array] = field(default_factory=list, repr=False)
 
 
 def world_from_map(
@@ -69,18 +71,18 @@ def world_from_map(
         surface = _even_odd(old_rings)
         gaps = _missing(old_curbs, curbs)
     shapely.prepare(surface)
-    paint = [p for e in vector_map.of_class("divider") for p in _line_paint(e, rng_for(e, seed))]
+    paint = [p for e in vector_map.of_class("divider") for p in _line_paint(e, rng_of(e, seed))]
     width = float(rng.uniform(0.3, 0.55))
     for element in vector_map.of_class("ped_crossing"):
         paint += _crossing_paint(element, width, seed)
+    besides = stop_lines(vector_map, seed) + arrows(vector_map, surface, seed)
+    paint += [Paint("white", polygon) for polygon in besides]
     ground = ground_of(surface_map or vector_map)
     objects = roadside(surface, seed)
-    return World(vector_map, surface, curbs, gaps, paint, objects, seed, ground=ground)
-
-
-def rng_for(element: Element, seed: int) -> np.random.Generator:
-    """A generator that depends on the element's id alone: other elements do not disturb it."""
-    return np.random.default_rng([seed, zlib.crc32(element.element_id.split("#")[0].encode())])
+    return World(
+        vector_map, surface, curbs, gaps, paint, objects, seed, ground=ground,
+        tar=seams(vector_map, seed),
+    )  # fmt: skip
 
 
 def _rings(vector_map: VectorMap) -> tuple[list[Array], list[Array], list[Array]]:
@@ -182,7 +184,7 @@ def stroke(line: Array, width: float) -> Array:
 def _crossing_paint(element: Element, width: float, seed: int) -> list[Paint]:
     """Zebra stripes, a ladder (stripes between two lines) or two outlines, white."""
     pattern = element.attributes.get("pattern", "")
-    rng = rng_for(element, seed)
+    rng = rng_of(element, seed)
     if pattern not in ("zebra", "ladder", "outline"):
         pattern = str(rng.choice(["zebra", "ladder", "outline"], p=[0.45, 0.25, 0.3]))
     corners = crossing_corners(element.xy)

@@ -95,12 +95,14 @@ def _layout(world: World) -> dict[str, Any]:
     layout: dict[str, Any] = world.boxes
     layout["sidewalk_width"] = float(rng.uniform(1.4, 3.2)) if rng.random() < 0.75 else 0.0
     layout["curb_width"] = float(rng.uniform(0.14, 0.32))
-    layout["wear"] = float(rng.uniform(0.0, 0.5))
+    layout["wear"] = float(rng.uniform(0.0, 0.5 if rng.random() < 0.8 else 0.9))
     layout["patches"] = float(rng.uniform(0.0, 1.0))
     layout["offset"] = rng.uniform(0, 100, 2)
     layout["paint"] = _boxes([p.polygon for p in world.paint])
     layout["soft"] = _boxes(world.soft)
     layout["curb"] = _boxes(world.curbs)
+    layout["tar"] = _boxes(world.tar)
+    layout["tar_width"] = float(rng.uniform(0.05, 0.16))
     return layout
 
 
@@ -173,8 +175,13 @@ def draw_tile(world: World, x0: float, y0: float, step: float, level: int) -> Im
         outer = fill(shapely.buffer(area, layout["sidewalk_width"], quad_segs=2))
     curb = _draw_curbs(cv2, world, layout, (x0, y0, side), pixels, size, scale)
     white, yellow = _draw_paint(cv2, world, layout, (x0, y0, side), pixels, size)
+    tar: Image | None = None
+    for k in _touching(layout["tar"], x0, y0, x0 + side, y0 + side) if level < 2 else ():
+        tar = np.zeros((size, size), np.uint8) if tar is None else tar
+        width = max(1, round(layout["tar_width"] * scale))
+        cv2.polylines(tar, [pixels(world.tar[k])], False, 255, width, cv2.LINE_8, SUBPIXEL)
     soft = _touching(layout["soft"], x0 - 12, y0 - 12, x0 + side + 12, y0 + side + 12)
-    layers = [asphalt, outer, curb, white, yellow]
+    layers = [asphalt, outer, curb, white, yellow, tar]
     inner = slice(fine, -fine)
     shares = []
     for mask in layers:
@@ -265,9 +272,10 @@ def _mix(
 ) -> Image:
     """Shares of the materials (they add up to at most one) and texture, as uint8 layers.
 
-    ``drawn``: coverage of asphalt, asphalt with sidewalk, curb, white and yellow paint in [0, 1].
+    ``drawn``: coverage of asphalt, asphalt with sidewalk, curb, white and yellow paint, tar in
+    [0, 1].
     """
-    asphalt, outer, curb, white, yellow = drawn
+    asphalt, outer, curb, white, yellow, tar = drawn
     ox, oy = layout["offset"]
     noise = _noise(x0 + ox * 10, y0 + oy * 10, step)
     texture, verge, blotches, fine_wear, broad_wear = noise
@@ -280,6 +288,7 @@ def _mix(
     road = asphalt * left
     side = np.clip(outer - asphalt, 0, 1) * left
     patch = np.clip((blotches + np.float32(layout["patches"])) * 4, 0, 1)
+    patch = np.maximum(patch, tar)
     first = cv2.merge([side, curb, road, white])
     second = cv2.merge([yellow, road * texture, (1 - road) * verge, road * patch])
     return np.stack([cv2.convertScaleAbs(layer, alpha=255.0) for layer in (first, second)])
