@@ -72,8 +72,9 @@ def pose_errors(network: Any, frames: Frames, limit: int) -> dict[str, Array]:
             "start": torch.zeros_like(batch.delta),
             "all of Q_prior": network.pose(prior[0], points, scale, batch.prior_mask).delta,
             "only Q_map": network.pose(prior[0], points, scale, kept).delta,
-            "learned head": prediction.poses[-1],
         }
+        if network.config.use_pose_loss:
+            found["learned head"] = prediction.poses[-1]
         for name, delta in found.items():
             off = (delta - batch.delta).abs().double().numpy() * [1.0, 1.0, np.degrees(1.0)]
             errors.setdefault(name, []).append(off)

@@ -35,12 +35,11 @@ from rtmap_models.paper.pose import LearnedPose  # noqa: E402
 from rtmap_models.paper.prediction import PaperPrediction  # noqa: E402
 from rtmap_models.resnet import ResNet, load_backbone  # noqa: E402
 from rtmap_models.samples import PriorNoise, Scene  # noqa: E402
-from rtmap_models.validate import area_under_curve  # noqa: E402
 
 from rtmap_cli.errors import BadInput  # noqa: E402
 from rtmap_cli.steps.evaluate.precision import Scorer  # noqa: E402
 
-CAMERAS = 3
+CAMERAS = 2
 
 
 def small(**changes: Any) -> PaperConfig:
@@ -150,11 +149,11 @@ def mean_ap(network: Any, batch: Batch) -> float:
 def learnt() -> tuple[Any, Batch, list[float], float]:
     """A network that has learnt eight frames by heart; loss by step; mAP before."""
     torch.manual_seed(0)
-    config = small()
+    config = small(many_queries=0)
     network = build_network(config)
     batch = batch_of(config, ["none", "hidden", "seen", "none"] * 2)
     before = mean_ap(network, batch)
-    return network, batch, fit(network, batch, 70), before
+    return network, batch, fit(network, batch, 90), before
 
 
 # --- configurations -------------------------------------------------------------------------
@@ -399,7 +398,7 @@ def test_learned_pose_ignores_unused_slots() -> None:
 
 def test_pose_of_the_graph_is_a_choice(learnt: Any) -> None:
     network = learnt[0].eval()
-    other = build_network(small(pose="learned"))
+    other = build_network(small(pose="learned", many_queries=0))
     other.load_state_dict(network.state_dict())
     inputs = example_inputs(network.config, 2, 3, 4)
     with torch.no_grad():
@@ -490,25 +489,17 @@ def test_a_false_element_that_is_believed_costs() -> None:
 @pytest.mark.parametrize(
     ("change", "gone"),
     [
-        ({"use_nll": False}, "laplace"),
-        ({"use_pose_loss": False}, "pose"),
-        ({"pose_weight": 0.0}, "pose"),
-        ({"direction_weight": 0.0}, "direction"),
-        ({"bev_segmentation_weight": 0.0}, "segmentation"),
-        ({"image_segmentation_weight": 0.0}, "image_segmentation"),
-        ({"many_queries": 0}, "many"),
-        ({"many_weight": 0.0}, "many"),
+        ({"use_nll": False, "use_pose_loss": False, "many_queries": 0}, "laplace pose many"),
+        ({"nll_weight": 0.0, "pose_weight": 0.0, "many_weight": 0.0}, "laplace pose many"),
+        ({"direction_weight": 0.0, "bev_segmentation_weight": 0.0}, "direction segmentation"),
+        ({"image_segmentation_weight": 0.0, "pre_attribution": False}, "image_segmentation"),
     ],
 )
-def test_every_part_of_the_loss_can_be_switched_off(
-    change: dict[str, Any], gone: str, learnt: Any
-) -> None:
-    network, batch, *_ = learnt
+def test_every_part_of_the_loss_can_be_switched_off(change: dict[str, Any], gone: str) -> None:
     full = {"class", "points", "laplace", "direction", "pose", "many", "segmentation"}
     full |= {"image_segmentation"}
-    other = build_network(small(**change)).train()
-    assert set(network.train().losses(batch)) == full
-    assert set(other.losses(batch)) == full - {gone}
+    network = build_network(small(**change)).train()
+    assert set(network.losses(batch_of(small(), ["none", "seen"]))) == full - set(gone.split())
 
 
 def test_formulas_of_the_losses() -> None:
@@ -554,14 +545,14 @@ def test_gradients_reach_every_parameter(encoder: str) -> None:
 
 def test_eight_frames_are_learnt_by_heart(learnt: Any) -> None:
     network, batch, history, before = learnt
-    assert np.mean(history[-3:]) < 0.25 * history[0]
-    assert before < 0.05 and mean_ap(network, batch) > 0.3
+    assert np.mean(history[-3:]) < 0.2 * history[0]
+    assert before < 0.05 and mean_ap(network, batch) > 0.5
     with torch.no_grad():
         last = network.predict_batch(batch).layers[-1]
     n = network.config.new_queries
-    used = batch.prior_mask > 0
-    pairs = zip(last.logits[:, n:, 3][used].tolist(), batch.prior_real[used] > 0, strict=True)
-    assert area_under_curve(list(pairs)) > 0.75
+    exists, used = last.logits[:, n:, 3], batch.prior_mask > 0
+    real, false = (exists[used & (batch.prior_real == k)] for k in (1, 0))
+    assert len(real) > 2 and len(false) > 2 and float(real.mean() - false.mean()) > 0.2
 
 
 def test_export_equals_torch_at_two_sizes(learnt: Any, tmp_path: Path) -> None:
@@ -582,7 +573,7 @@ def test_a_raster_takes_the_cameras_place() -> None:
     network = build_network(config)
     batch = batch_of(config, ["none", "hidden"])
     history = fit(network, batch, 25)
-    assert history[-1] < 0.6 * history[0]
+    assert history[-1] < 0.7 * history[0]
     prior = (batch.prior_points, batch.prior_class, batch.prior_mask)
     with torch.no_grad():
         answer = network.eval()(batch.picture / 255.0, *prior)
