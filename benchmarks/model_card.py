@@ -15,6 +15,8 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -214,6 +216,51 @@ def latency(path: Path, config: ModelConfig, shot: Shot) -> dict[str, dict[str, 
     return out
 
 
+def tables(report: dict[str, Any]) -> Iterator[str]:
+    """The report as tables for people."""
+    for name, part in report.items():
+        if not isinstance(part, dict) or "frames" not in part:
+            continue
+        found = {k: v for k, v in part.items() if isinstance(v, dict)}
+        yield f"\n### {name} ({part['frames']} frames)\n"
+        head = "prior | mAP | crossing | divider | boundary | AUC | error | 50 % / 90 % | Spearman"
+        yield f"| {head} |"
+        yield "|---" * 9 + "|"
+        for prior, r in found.items():
+            classes = [
+                f"{np.mean(list(c['ap'].values())):.3f}" for c in r["map"]["classes"].values()
+            ]
+            unchanged = f" ({r['unchanged prior mAP']:.3f})" if "pose" in r else ""
+            auc = f"{r['existence AUC']:.3f}" if r.get("existence AUC") else "–"
+            held = f"{r['within 50 %']:.0%} / {r['within 90 %']:.0%}"
+            row = [prior, f"{r['map']['mAP']:.3f}{unchanged}", *classes, auc]
+            row += [f"{r['mean error m']:.2f} m", held, f"{r['sigma spearman']:.2f}"]
+            yield "| " + " | ".join(row) + " |"
+        if not any("pose" in r for r in found.values()):
+            continue
+        yield "\n| pose, from | mean | median | 90th percentile | 50 % / 90 % hold (x; y; yaw) |"
+        yield "|---" * 5 + "|"
+        for prior, r in found.items():
+            if "pose" not in r:
+                continue
+            pose = r["pose"]
+            three = [
+                "{:.2f} m, {:.2f} m, {:.2f}°".format(*pose[k])
+                for k in ("start", "mean", "median", "90th percentile")
+            ]
+            held = "; ".join(
+                f"{a:.0%} / {b:.0%}"
+                for a, b in zip(pose["within 50 %"], pose["within 90 %"], strict=True)
+            )
+            yield (
+                f"| {three[0]} ({prior.removeprefix('prior, ')}) | "
+                + " | ".join([*three[1:], held])
+                + " |"
+            )
+    for threads, r in report.get("latency", {}).items():
+        yield f"\n{threads}: {r['median ms']:.0f} ms ({r['90th percentile ms']:.0f} ms)"
+
+
 def main() -> None:
     """Measure and print one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -222,6 +269,9 @@ def main() -> None:
     parser.add_argument("--towns", type=int, default=40)
     parser.add_argument("--frames", type=int, default=6, help="per town")
     parser.add_argument("--av2", type=Path, nargs="+", default=[], help="logs with real maps")
+    parser.add_argument("--markdown", action="store_true", help="tables instead of JSON")
+    parser.add_argument("--no-level", action="store_true", help="cameras as calibrated")
+    parser.add_argument("--priors", choices=("none", "all"), default="all")
     parser.add_argument("--av2-frames", type=int, default=32, help="per log and kind of place")
     a = parser.parse_args()
     config, model = load_config(a.config), MapModel(str(a.model))
@@ -232,12 +282,19 @@ def main() -> None:
             shots = [shot for w in worlds for shot in getattr(w, kind)(a.av2_frames)]
             sets[f"{kind.replace('_', ' ')} over real maps, {ground}"] = shots
     report: dict[str, Any] = {"model": model.info.name, "sha256": model.info.sha256}
+    if a.no_level:
+        sets = {name: [replace(s, level=False) for s in shots] for name, shots in sets.items()}
     for name, views in sets.items():
         report[name] = {"frames": len(views)}
         for prior, noise in PRIORS.items():
+            if noise is not None and a.priors == "none":
+                continue
             report[name][prior] = measure(model, config, views, noise)
     report["latency"] = latency(a.model, config, sets["unseen towns"][0])
-    print(json.dumps(report, indent=1, default=float, ensure_ascii=False))
+    if a.markdown:
+        print("\n".join(tables(report)))
+    else:
+        print(json.dumps(report, indent=1, default=float, ensure_ascii=False))
 
 
 if __name__ == "__main__":

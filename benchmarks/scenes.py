@@ -49,10 +49,13 @@ class Shot:
     known: Array
     path: Sequence[Array]
     vector_map: VectorMap
+    level: bool = True
 
     def cameras(self, delta: Array | None) -> NDArray[np.float32]:
         """(N, 3, 4) projections levelled from the path or, with a prior that is off by ``delta``
         (dx, dy, dyaw: true = initial · SE2(delta)), from the heights of the map there."""
+        if not self.level:
+            return self.view.ego_to_image
         road = RoadUnder(self.path, None if delta is None else self.vector_map)
         pose = self.known
         if delta is not None:
