@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +11,9 @@ from torch.nn import functional as F
 from rtmap_models.config import ModelConfig
 from rtmap_models.decoder import LayerOutput
 from rtmap_models.pose import PoseEstimate, PoseHead
+
+if TYPE_CHECKING:
+    from rtmap_models.dataset import Batch
 
 
 class Answer(NamedTuple):
@@ -55,6 +58,14 @@ class AnsweringNet(nn.Module):
         line = torch.tensor([1.0, 0.0]).repeat(2, len(config.classes), 1)
         # Not kept with the weights: measured anew for every export.
         self.register_buffer("score_line", line, persistent=False)
+
+    def predict_batch(self, batch: Batch, bf16: bool = False) -> Layers:
+        """All layers on a training batch; convolutions in bfloat16 where that is asked for."""
+        raise NotImplementedError
+
+    def losses(self, batch: Batch, bf16: bool = False) -> dict[str, Tensor]:
+        """The weighted parts of the loss by name; their sum is the loss."""
+        raise NotImplementedError
 
     def answer(
         self, prediction: Layers, prior_points: Tensor, prior_class: Tensor, prior_mask: Tensor

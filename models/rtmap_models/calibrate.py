@@ -13,10 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_models.bev import normalize_picture
+from rtmap_models.answer import Answer, AnsweringNet, Layers
 from rtmap_models.dataset import Batch, Frames, collate, make_sample
 from rtmap_models.matcher import Matcher
-from rtmap_models.network import Answer, Prediction, RTMapNet
 from rtmap_models.samples import PriorNoise
 
 LAPLACE_80 = math.log(5.0)
@@ -28,7 +27,9 @@ Ratios = NDArray[np.float64]
 
 
 @torch.no_grad()
-def calibrate(network: RTMapNet, frames: Frames, seed: int = 0, batch: int = 8) -> dict[str, float]:
+def calibrate(
+    network: AnsweringNet, frames: Frames, seed: int = 0, batch: int = 8
+) -> dict[str, float]:
     """Set ``sigma_factor`` and ``pose.inflation`` of a network from held-out frames.
 
     Every frame is read with a prior of 1 m / 1° that the new queries do not see. Returns the
@@ -48,13 +49,7 @@ def calibrate(network: RTMapNet, frames: Frames, seed: int = 0, batch: int = 8) 
             make_sample(frames[k], config, rng, noise, prior="hidden", train=False) for k in index
         ]
         data = collate(samples, config)
-        prediction = network.predict(
-            normalize_picture(data.picture),
-            data.prior_points,
-            data.prior_class,
-            data.prior_mask,
-            data.prior_visible,
-        )
+        prediction = network.predict_batch(data)
         _collect(ratios, prediction, data)
     for (class_id, kind), values in ratios.items():
         ratio = float(np.quantile(np.concatenate(values), 0.8)) / LAPLACE_80
@@ -63,9 +58,7 @@ def calibrate(network: RTMapNet, frames: Frames, seed: int = 0, batch: int = 8) 
     return _named(network)
 
 
-def _collect(
-    ratios: dict[tuple[int, int], list[Ratios]], prediction: Prediction, data: Batch
-) -> None:
+def _collect(ratios: dict[tuple[int, int], list[Ratios]], prediction: Layers, data: Batch) -> None:
     """Ratios |error| / b of matched new queries (kind 0) and of real prior slots (kind 1)."""
     last, n = prediction.layers[-1], prediction.new_count
     match = Matcher(data)(last, n)
@@ -89,7 +82,7 @@ def _collect(
 
 
 def _calibrate_pose(
-    network: RTMapNet, frames: Frames, seed: int, noise: PriorNoise, batch: int
+    network: AnsweringNet, frames: Frames, seed: int, noise: PriorNoise, batch: int
 ) -> None:
     config, rng = network.config, np.random.default_rng([seed, 1])
     ratios: list[Ratios] = []
@@ -100,15 +93,14 @@ def _calibrate_pose(
         ]
         data = collate(samples, config)
         prior = (data.prior_points, data.prior_class, data.prior_mask)
-        picture = normalize_picture(data.picture)
-        answer: Answer = network.answer(network.predict(picture, *prior), *prior)
+        answer: Answer = network.answer(network.predict_batch(data), *prior)
         sigma = answer.pose_covariance.diagonal(dim1=1, dim2=2).sqrt()
         ratios.append(((answer.pose_delta - data.delta).abs() / sigma).numpy())
     quantile = np.quantile(np.concatenate(ratios), 0.8, axis=0) / NORMAL_80
     network.pose.inflation.copy_(torch.from_numpy(np.clip(quantile, 0.5, 20.0)).float())
 
 
-def _named(network: RTMapNet) -> dict[str, float]:
+def _named(network: AnsweringNet) -> dict[str, float]:
     out = {}
     for c, name in enumerate(network.config.classes):
         for kind, what in enumerate(("new", "prior")):

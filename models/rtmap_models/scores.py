@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from rtmap_cli.maps.prior import DUPLICATE_M, on_prior
-from rtmap_models.bev import normalize_picture
+from rtmap_models.answer import AnsweringNet
 from rtmap_models.calibrate import FOUND_M
 from rtmap_models.dataset import Batch, Frames, collate, make_sample
 from rtmap_models.decoder import LayerOutput
-from rtmap_models.network import RTMapNet
 from rtmap_models.samples import PriorNoise
 
 Pairs = NDArray[np.float64]
@@ -26,7 +25,7 @@ Pairs = NDArray[np.float64]
 
 @torch.no_grad()
 def calibrate_scores(
-    network: RTMapNet, frames: Frames, seed: int = 0, batch: int = 8
+    network: AnsweringNet, frames: Frames, seed: int = 0, batch: int = 8
 ) -> dict[str, list[float]]:
     """Set ``score_line`` from held-out frames; returns slope and offset by mode and class."""
     network.eval()
@@ -41,8 +40,7 @@ def calibrate_scores(
                 make_sample(frames[k], config, rng, noise, prior=prior, train=False) for k in index
             ]
             data = collate(samples, config)
-            slots = (data.prior_points, data.prior_class, data.prior_mask)
-            prediction = network.predict(normalize_picture(data.picture), *slots)
+            prediction = network.predict_batch(data)
             _collect(pairs, prediction.layers[-1], prediction.new_count, data)
         for c, name in enumerate(config.classes):
             line = fit_line(np.concatenate(pairs[c])) if c in pairs else np.array([1.0, 0.0])
