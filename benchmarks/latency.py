@@ -27,8 +27,8 @@ import onnxruntime
 import torch
 from rtmap_models.architecture import build_network
 from rtmap_models.config import config_from_dict, load_config
-from rtmap_models.example import example_inputs
-from rtmap_models.export import INPUTS, read_configuration, read_weights
+from rtmap_models.export.example import example_inputs
+from rtmap_models.export.onnx_file import INPUTS, read_configuration, read_weights
 from torch import nn
 
 from rtmap_cli.logs.open import open_log

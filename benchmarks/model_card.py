@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rtmap_models.config import ModelConfig, load_config
-from rtmap_models.samples import Pieces, Prior, PriorNoise, clip, make_prior
+from rtmap_models.data.samples import Pieces, Prior, PriorNoise, clip, make_prior
 from scenes import RealMap, Shot, unseen_towns
 from scipy.stats import spearmanr
 

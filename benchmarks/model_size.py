@@ -16,7 +16,7 @@ import time
 import torch
 from rtmap_models.architecture import build_network
 from rtmap_models.config import CONFIGS, load_config
-from rtmap_models.example import example_inputs
+from rtmap_models.export.example import example_inputs
 from torch.utils.flop_counter import FlopCounterMode
 
 

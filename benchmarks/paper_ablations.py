@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rtmap_models.checkpoint import load_network
 from rtmap_models.config import PaperConfig, load_config
-from rtmap_models.dataset import Frames, collate, make_sample
-from rtmap_models.generate import generate
-from rtmap_models.recipe import load_recipe
-from rtmap_models.train import TrainOptions, train
-from rtmap_models.validate import CHANGED, validate
+from rtmap_models.data.dataset import Frames, collate, make_sample
+from rtmap_models.data.generate import generate
+from rtmap_models.training.checkpoint import load_network
+from rtmap_models.training.recipe import load_recipe
+from rtmap_models.training.train import TrainOptions, train
+from rtmap_models.training.validate import CHANGED, validate
 
 VARIANTS: dict[str, dict[str, bool]] = {
     "full": {},

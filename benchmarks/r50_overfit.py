@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from rtmap_models.architecture import build_network
 from rtmap_models.config import load_config
-from rtmap_models.dataset import Frames, collate, make_sample
-from rtmap_models.export import export_onnx
-from rtmap_models.generate import generate
-from rtmap_models.samples import PriorNoise
-from rtmap_models.validate import validate
+from rtmap_models.data.dataset import Frames, collate, make_sample
+from rtmap_models.data.generate import generate
+from rtmap_models.data.samples import PriorNoise
+from rtmap_models.export.onnx_file import export_onnx
+from rtmap_models.training.validate import validate
 
 FRAMES = 8
 NOISE = PriorNoise(1.0, 1.0, 0.15, 0.15, 0.0)

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from rtmap_models.config import ModelConfig
-from rtmap_models.generate import TownStage, projections
-from rtmap_models.views import View, scene_at
+from rtmap_models.data.generate import TownStage, projections
+from rtmap_models.data.views import View, scene_at
 from scipy.spatial.transform import Rotation
 
 from rtmap_cli.formats.av2 import Av2Log

@@ -15,12 +15,12 @@ pytest.importorskip("onnxscript", reason="onnxscript is not installed (extra: tr
 
 import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
-from rtmap_models import export  # noqa: E402
 from rtmap_models.architecture import build_network  # noqa: E402
-from rtmap_models.checkpoint import load_network, save_checkpoint  # noqa: E402
 from rtmap_models.config import CONFIGS, load_config  # noqa: E402
-from rtmap_models.export import read_configuration, read_weights  # noqa: E402
-from rtmap_models.gathers import spell_out_grid_samples  # noqa: E402
+from rtmap_models.export import onnx_file  # noqa: E402
+from rtmap_models.export.gathers import spell_out_grid_samples  # noqa: E402
+from rtmap_models.export.onnx_file import read_configuration, read_weights  # noqa: E402
+from rtmap_models.training.checkpoint import load_network, save_checkpoint  # noqa: E402
 
 from rtmap_cli.errors import BadInput  # noqa: E402
 from rtmap_cli.steps.infer import find_model  # noqa: E402
@@ -70,7 +70,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def traced_once() -> Iterator[None]:
     """Tracing takes most of an export; the same weights are traced once for all tests."""
     made: list[onnx.ModelProto] = []
-    trace = export._trace
+    trace = onnx_file._trace
 
     def traced(network: Any) -> onnx.ModelProto:
         if not made:
@@ -80,7 +80,7 @@ def traced_once() -> Iterator[None]:
         return copy
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(export, "_trace", traced)
+        patch.setattr(onnx_file, "_trace", traced)
         yield
 
 
@@ -183,7 +183,7 @@ def test_half_precision(weights: Path, exported: dict[str, Any], tmp_path: Path)
 
 def test_places_stay_single_precision(weights: Path, exported: dict[str, Any]) -> None:
     """What feeds a grid, a pose or an output is computed in float32 in the half variant."""
-    from rtmap_models.half import to_half
+    from rtmap_models.export.half import to_half
 
     model = onnx.load(exported["path"])
     to_half(model)

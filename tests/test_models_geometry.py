@@ -11,8 +11,7 @@ cv2 = pytest.importorskip("cv2", reason="opencv is not installed (extra: train)"
 from rtmap_models.answer import laplace_sigma  # noqa: E402
 from rtmap_models.bev import BevWarp, camera_centres, cell_centres  # noqa: E402
 from rtmap_models.config import load_config  # noqa: E402
-from rtmap_models.pose import PoseHead, inverse3, solve3  # noqa: E402
-from rtmap_models.samples import (  # noqa: E402
+from rtmap_models.data.samples import (  # noqa: E402
     FIELD_REACH_M,
     PriorNoise,
     Scene,
@@ -24,6 +23,7 @@ from rtmap_models.samples import (  # noqa: E402
     rotation,
     segmentation_target,
 )
+from rtmap_models.pose import PoseHead, inverse3, solve3  # noqa: E402
 
 from rtmap_cli.geometry.cameras import projection  # noqa: E402
 

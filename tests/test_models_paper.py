@@ -17,10 +17,10 @@ cv2 = pytest.importorskip("cv2", reason="opencv is not installed (extra: train)"
 
 from rtmap_models.architecture import build_network  # noqa: E402
 from rtmap_models.config import CONFIGS, PaperConfig, config_from_dict, load_config  # noqa: E402
-from rtmap_models.dataset import Batch, Frame, collate, make_sample, window_size  # noqa: E402
-from rtmap_models.decoder import LayerOutput  # noqa: E402
-from rtmap_models.example import example_inputs  # noqa: E402
-from rtmap_models.export import export_onnx  # noqa: E402
+from rtmap_models.data.dataset import Batch, Frame, collate, make_sample, window_size  # noqa: E402
+from rtmap_models.data.samples import PriorNoise, Scene  # noqa: E402
+from rtmap_models.export.example import example_inputs  # noqa: E402
+from rtmap_models.export.onnx_file import export_onnx  # noqa: E402
 from rtmap_models.paper.assign import Assigner, jobs_of, many_jobs  # noqa: E402
 from rtmap_models.paper.criterion import (  # noqa: E402
     focal_loss,
@@ -33,8 +33,8 @@ from rtmap_models.paper.encoders import CameraEncoder  # noqa: E402
 from rtmap_models.paper.lift import CameraLift, project  # noqa: E402
 from rtmap_models.paper.pose import LearnedPose  # noqa: E402
 from rtmap_models.paper.prediction import PaperPrediction  # noqa: E402
-from rtmap_models.resnet import ResNet, load_backbone  # noqa: E402
-from rtmap_models.samples import PriorNoise, Scene  # noqa: E402
+from rtmap_models.paper.resnet import ResNet, load_backbone  # noqa: E402
+from rtmap_models.tiny.decoder import LayerOutput  # noqa: E402
 
 from rtmap_cli.errors import BadInput  # noqa: E402
 from rtmap_cli.steps.evaluate.precision import Scorer  # noqa: E402

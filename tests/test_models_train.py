@@ -17,16 +17,16 @@ cv2 = pytest.importorskip("cv2", reason="opencv is not installed (extra: train)"
 import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
 from rtmap_models.bev import normalize_picture  # noqa: E402
-from rtmap_models.calibrate import calibrate  # noqa: E402
-from rtmap_models.checkpoint import load_network  # noqa: E402
 from rtmap_models.config import load_config  # noqa: E402
-from rtmap_models.criterion import LossWeights, compute_losses  # noqa: E402
-from rtmap_models.dataset import Frames, collate, make_sample  # noqa: E402
-from rtmap_models.export import OUTPUTS, example_inputs, parity  # noqa: E402
-from rtmap_models.matcher import Matcher  # noqa: E402
-from rtmap_models.network import RTMapNet  # noqa: E402
-from rtmap_models.recipe import Recipe  # noqa: E402
-from rtmap_models.train import TrainOptions, train  # noqa: E402
+from rtmap_models.data.dataset import Frames, collate, make_sample  # noqa: E402
+from rtmap_models.export.onnx_file import OUTPUTS, example_inputs, parity  # noqa: E402
+from rtmap_models.tiny.criterion import LossWeights, compute_losses  # noqa: E402
+from rtmap_models.tiny.matcher import Matcher  # noqa: E402
+from rtmap_models.tiny.network import RTMapNet  # noqa: E402
+from rtmap_models.training.calibrate import calibrate  # noqa: E402
+from rtmap_models.training.checkpoint import load_network  # noqa: E402
+from rtmap_models.training.recipe import Recipe  # noqa: E402
+from rtmap_models.training.train import TrainOptions, train  # noqa: E402
 from training_frames import painted_frames, tiny_config  # noqa: E402
 
 from rtmap_cli.errors import BadInput  # noqa: E402

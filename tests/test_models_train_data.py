@@ -16,7 +16,7 @@ cv2 = pytest.importorskip("cv2", reason="opencv is not installed (extra: train)"
 
 from rtmap_models.bev import BevWarp  # noqa: E402
 from rtmap_models.config import ModelConfig, TinyConfig, load_config  # noqa: E402
-from rtmap_models.dataset import (  # noqa: E402
+from rtmap_models.data.dataset import (  # noqa: E402
     Augmentation,
     Frame,
     Frames,
@@ -28,10 +28,10 @@ from rtmap_models.dataset import (  # noqa: E402
     window_size,
     write_shard,
 )
-from rtmap_models.live import Window  # noqa: E402
-from rtmap_models.recipe import Recipe, load_recipe  # noqa: E402
-from rtmap_models.samples import Scene  # noqa: E402
-from rtmap_models.sources import gather, logs_in  # noqa: E402
+from rtmap_models.data.live import Window  # noqa: E402
+from rtmap_models.data.samples import Scene  # noqa: E402
+from rtmap_models.data.sources import gather, logs_in  # noqa: E402
+from rtmap_models.training.recipe import Recipe, load_recipe  # noqa: E402
 from training_frames import painted_frames, tiny_config  # noqa: E402
 
 from rtmap_cli.errors import BadInput, UsageError  # noqa: E402

@@ -19,14 +19,14 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed (extra: train)")
 pytest.importorskip("cv2", reason="opencv is not installed (extra: train)")
 
-from rtmap_models.checkpoint import load_checkpoint, save_checkpoint, start_from  # noqa: E402
 from rtmap_models.config import load_config  # noqa: E402
-from rtmap_models.dataset import Frames  # noqa: E402
-from rtmap_models.distributed import Group, pick_device, run_workers  # noqa: E402
-from rtmap_models.feed import Feed  # noqa: E402
-from rtmap_models.network import RTMapNet  # noqa: E402
-from rtmap_models.recipe import Recipe  # noqa: E402
-from rtmap_models.validate import validate  # noqa: E402
+from rtmap_models.data.dataset import Frames  # noqa: E402
+from rtmap_models.tiny.network import RTMapNet  # noqa: E402
+from rtmap_models.training.checkpoint import load_checkpoint, save_checkpoint, start_from  # noqa: E402
+from rtmap_models.training.distributed import Group, pick_device, run_workers  # noqa: E402
+from rtmap_models.training.feed import Feed  # noqa: E402
+from rtmap_models.training.recipe import Recipe  # noqa: E402
+from rtmap_models.training.validate import validate  # noqa: E402
 from training_frames import painted_frames, tiny_config  # noqa: E402
 
 from rtmap_cli.errors import BadInput, UsageError  # noqa: E402

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from rtmap_models.config import CONFIGS, load_config
-from rtmap_models.dataset import window_half, window_size, write_shard
-from rtmap_models.samples import Scene
+from rtmap_models.data.dataset import window_half, window_size, write_shard
+from rtmap_models.data.samples import Scene
 
 TINY = {
     "cell_m = 0.25": "cell_m = 0.75",

@@ -9,11 +9,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rtmap_models.config import ModelConfig
-from rtmap_models.decoder import LayerOutput
 from rtmap_models.pose import PoseEstimate, PoseHead
+from rtmap_models.tiny.decoder import LayerOutput
 
 if TYPE_CHECKING:
-    from rtmap_models.dataset import Batch
+    from rtmap_models.data.dataset import Batch
 
 
 class Answer(NamedTuple):

@@ -18,7 +18,7 @@ def build_network(config: ModelConfig) -> nn.Module:
         from rtmap_models.paper.network import build_paper_network
 
         return build_paper_network(config)
-    from rtmap_models.network import RTMapNet
+    from rtmap_models.tiny.network import RTMapNet
 
     assert isinstance(config, TinyConfig)
     return RTMapNet(config)

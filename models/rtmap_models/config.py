@@ -226,5 +226,5 @@ def load_config(name: str | Path = "rtmap-tiny") -> ModelConfig:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise BadInput(path, f"not TOML: {error}", "mend the file") from error
-    values.pop("training", None)  # how to train it, not what it is: rtmap_models.recipe
+    values.pop("training", None)  # how to train it, not what it is: rtmap_models.training.recipe
     return config_from_dict(values, path)

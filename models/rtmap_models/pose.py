@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from rtmap_models.decoder import unit_tangents
+from rtmap_models.tiny.decoder import unit_tangents
 
 LEVER_M = 10.0
 """Yaw is solved as metres at this distance: all unknowns are then of one size."""

@@ -64,8 +64,8 @@ def command(
     if report is not None and report.resolve() == output.resolve():
         raise UsageError("--report and --output are the same file")
     try:
-        from rtmap_models.checkpoint import load_network
-        from rtmap_models.export import ParityMiss, export_onnx
+        from rtmap_models.export.onnx_file import ParityMiss, export_onnx
+        from rtmap_models.training.checkpoint import load_network
     except ModuleNotFoundError as error:
         raise UsageError(f"{NEEDS} ({error.name} is missing)") from None
     import json
@@ -100,7 +100,7 @@ def _metadata(
     factors: dict[str, Any],
 ) -> dict[str, Any]:
     """What the checkpoint and the caller say about the model."""
-    from rtmap_models.export import code_version
+    from rtmap_models.export.onnx_file import code_version
 
     amount = f"{content['frames']} frames, {content['samples']} samples"
     metadata: dict[str, Any] = {
@@ -120,9 +120,9 @@ def _calibrated(network: Any, frames: Path | None) -> dict[str, Any]:
     """Scale the network's uncertainties and scores on held-out frames; the factors by name."""
     if frames is None:
         return {}
-    from rtmap_models.calibrate import calibrate
-    from rtmap_models.dataset import Frames
-    from rtmap_models.scores import calibrate_scores
+    from rtmap_models.data.dataset import Frames
+    from rtmap_models.training.calibrate import calibrate
+    from rtmap_models.training.scores import calibrate_scores
 
     held_out = Frames(frames, network.config)
     return {**calibrate(network, held_out), **calibrate_scores(network, held_out)}

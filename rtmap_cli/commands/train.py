@@ -87,7 +87,7 @@ def command(output: Path, config: str, **given: Any) -> int:
     _check(output, given)
     try:
         from rtmap_models.config import load_config
-        from rtmap_models.distributed import torchrun
+        from rtmap_models.training.distributed import torchrun
     except ModuleNotFoundError as error:
         raise UsageError(f"{NEEDS} ({error.name} is missing)") from None
     with torchrun(given["device"]) as group:
@@ -118,9 +118,9 @@ def _run(sizes: Any, config: str, output: Path, given: dict[str, Any], group: An
     from contextlib import nullcontext
     from os import cpu_count
 
-    from rtmap_models.distributed import pick_device
-    from rtmap_models.recipe import load_recipe
-    from rtmap_models.train import TrainOptions, train
+    from rtmap_models.training.distributed import pick_device
+    from rtmap_models.training.recipe import load_recipe
+    from rtmap_models.training.train import TrainOptions, train
 
     from rtmap_cli.output import log
 
@@ -145,7 +145,7 @@ def _run(sizes: Any, config: str, output: Path, given: dict[str, Any], group: An
     first = group is None or group.rank == 0
     rendering: Any = nullcontext()
     if given["live"] and first:
-        from rtmap_models.live import rendering as render
+        from rtmap_models.data.live import rendering as render
 
         keep = sizes.needs_images or given["keep_images"]
         rendering = render(sizes, data[0], given["frames"], given["seed"], workers, keep)
@@ -163,7 +163,7 @@ def _make_frames(
 ) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
     """Folders of frames for --data with --frames and for --validate, rendered and converted where
     they are missing."""
-    from rtmap_models.sources import gather, is_frame_folder
+    from rtmap_models.data.sources import gather, is_frame_folder
 
     from rtmap_cli.output import log
 
@@ -175,7 +175,7 @@ def _make_frames(
         towns = places[0] if places else output.parent / "frames"
         data = [str(towns), *(d for d in data if Path(d) != towns)]
         if given["frames"] is not None:
-            from rtmap_models.generate import generate
+            from rtmap_models.data.generate import generate
 
             count, seed = given["frames"], given["seed"]
             generate(sizes, towns, count, seed, workers, report, keep_images=keep)

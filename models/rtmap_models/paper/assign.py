@@ -16,9 +16,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from rtmap_models.config import PaperConfig
-from rtmap_models.dataset import Batch
-from rtmap_models.decoder import LayerOutput
-from rtmap_models.matcher import Matches
+from rtmap_models.data.dataset import Batch
+from rtmap_models.tiny.decoder import LayerOutput
+from rtmap_models.tiny.matcher import Matches
 
 ALPHA = 0.25
 """Weight of positives in focal costs and losses (γ = 2)."""

@@ -16,12 +16,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rtmap_models.config import PaperConfig
-from rtmap_models.dataset import Batch
-from rtmap_models.decoder import LayerOutput
-from rtmap_models.matcher import Matches
+from rtmap_models.data.dataset import Batch
 from rtmap_models.paper.assign import ALPHA, Assigner, jobs_of, many_jobs
 from rtmap_models.paper.lift import project
 from rtmap_models.paper.prediction import PaperPrediction
+from rtmap_models.tiny.decoder import LayerOutput
+from rtmap_models.tiny.matcher import Matches
 
 SMOOTH = 0.01
 """Where the smooth L1 of the pose turns from square to straight: 1 cm, 0.57°."""

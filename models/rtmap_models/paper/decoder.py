@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from rtmap_models.config import PaperConfig
-from rtmap_models.decoder import LayerOutput
 from rtmap_models.paper.attention import DeformableAttention, SelfAttention
 from rtmap_models.paper.queries import HybridQueries
+from rtmap_models.tiny.decoder import LayerOutput
 
 STEP_M = 4.0
 """Metres per unit of the refinement head, so that its weights stay near one."""

@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rtmap_cli.errors import BadInput
-from rtmap_models.backbone import Residual, conv_block
 from rtmap_models.config import PaperConfig
-from rtmap_models.dataset import Batch
+from rtmap_models.data.dataset import Batch
 from rtmap_models.paper.lift import CameraLift
-from rtmap_models.resnet import ResNet, normalize_images
+from rtmap_models.paper.resnet import ResNet, normalize_images
+from rtmap_models.tiny.backbone import Residual, conv_block
 
 
 class Encoded(NamedTuple):

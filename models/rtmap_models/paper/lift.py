@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from rtmap_models.bev import MIN_DEPTH, cell_centres
 from rtmap_models.config import PaperConfig
-from rtmap_models.decoder import BLOCKED
+from rtmap_models.tiny.decoder import BLOCKED
 
 VIEWS = 2
 """Cameras per point: neighbours overlap, never more than two by much."""

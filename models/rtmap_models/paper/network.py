@@ -8,8 +8,7 @@ from torch.nn import functional as F
 
 from rtmap_models.answer import Answer, AnsweringNet, Layers
 from rtmap_models.config import PaperConfig
-from rtmap_models.dataset import Batch
-from rtmap_models.decoder import attention_bias
+from rtmap_models.data.dataset import Batch
 from rtmap_models.paper.criterion import paper_losses
 from rtmap_models.paper.decoder import LayerTokens, PaperDecoder
 from rtmap_models.paper.encoders import CameraEncoder, Encoded, RasterEncoder
@@ -17,6 +16,7 @@ from rtmap_models.paper.pose import LearnedPose
 from rtmap_models.paper.prediction import PaperPrediction
 from rtmap_models.paper.queries import QueryEncoder
 from rtmap_models.pose import PoseEstimate
+from rtmap_models.tiny.decoder import attention_bias
 
 
 class PaperNet(AnsweringNet):

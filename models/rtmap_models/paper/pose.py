@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from rtmap_models.config import PaperConfig
-from rtmap_models.decoder import BLOCKED
+from rtmap_models.tiny.decoder import BLOCKED
 
 POSE_UNIT = (1.0, 1.0, 0.02)
 """Metres, metres and radians per unit of the head: all outputs are then of one size."""

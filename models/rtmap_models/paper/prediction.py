@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from rtmap_models.decoder import LayerOutput
+from rtmap_models.tiny.decoder import LayerOutput
 
 
 class PaperPrediction(NamedTuple):

@@ -32,8 +32,8 @@ from rtmap_cli.steps.infer.images import FittedCamera
 from rtmap_cli.steps.infer.levelling import RoadUnder
 from rtmap_cli.tables import whole_folder
 from rtmap_models.config import ModelConfig
-from rtmap_models.samples import Array
-from rtmap_models.views import Pictures, View, scene_at
+from rtmap_models.data.samples import Array
+from rtmap_models.data.views import Pictures, View, scene_at
 
 SHARD_FRAMES = 24
 

@@ -18,8 +18,8 @@ from torch import nn
 from rtmap_cli.errors import BadInput
 from rtmap_cli.steps.evaluate.precision import Detection, Scorer
 from rtmap_models.config import ModelConfig
-from rtmap_models.dataset import Batch, Frames, Sample, collate, make_sample
-from rtmap_models.samples import PriorNoise, clip
+from rtmap_models.data.dataset import Batch, Frames, Sample, collate, make_sample
+from rtmap_models.data.samples import PriorNoise, clip
 
 NOISE = PriorNoise(1.0, 1.0, 0.0, 0.0, 0.0)
 CHANGED = PriorNoise(1.0, 1.0, 0.15, 0.15, 0.0)

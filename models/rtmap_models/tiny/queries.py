@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rtmap_models.backbone import conv_block
 from rtmap_models.bev import cell_centres
 from rtmap_models.config import TinyConfig
+from rtmap_models.tiny.backbone import conv_block
 
 OFFSET_SCALE = 8.0
 """Metres per unit of the proposal head, so that its weights stay near one."""

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from rtmap_cli.errors import BadInput
 from rtmap_cli.tables import whole_file
 from rtmap_models.config import ModelConfig
-from rtmap_models.samples import Scene
+from rtmap_models.data.samples import Scene
 
 WINDOW_MARGIN_M = (6.0, 8.0)
 """How much the cached picture is wider than the range on each side, x and y."""

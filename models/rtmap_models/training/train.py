@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from rtmap_cli.errors import BadInput, UsageError
-from rtmap_models.checkpoint import load_resumable
 from rtmap_models.config import ModelConfig
-from rtmap_models.dataset import Frames
-from rtmap_models.distributed import Group, pick_device, run_workers
-from rtmap_models.trainer import Trainer, TrainOptions
+from rtmap_models.data.dataset import Frames
+from rtmap_models.training.checkpoint import load_resumable
+from rtmap_models.training.distributed import Group, pick_device, run_workers
+from rtmap_models.training.trainer import Trainer, TrainOptions
 
 __all__ = ["TrainOptions", "train"]
 

@@ -15,14 +15,14 @@ from torch import Tensor
 
 from rtmap_cli.output import log
 from rtmap_models.architecture import build_network
-from rtmap_models.checkpoint import load_resumable, save_checkpoint, start_from
 from rtmap_models.config import ModelConfig
-from rtmap_models.dataset import Batch, Frames
-from rtmap_models.distributed import Group, StopSignals
-from rtmap_models.feed import Feed
-from rtmap_models.journal import Journal
-from rtmap_models.recipe import Recipe
-from rtmap_models.validate import validate
+from rtmap_models.data.dataset import Batch, Frames
+from rtmap_models.training.checkpoint import load_resumable, save_checkpoint, start_from
+from rtmap_models.training.distributed import Group, StopSignals
+from rtmap_models.training.feed import Feed
+from rtmap_models.training.journal import Journal
+from rtmap_models.training.recipe import Recipe
+from rtmap_models.training.validate import validate
 
 
 @dataclass(frozen=True)

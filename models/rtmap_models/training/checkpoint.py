@@ -115,7 +115,7 @@ def _read_state(source: str) -> Mapping[str, Tensor]:
 
         path = find_model(source)
     if path.suffix == ".onnx":
-        from rtmap_models.onnx_weights import read_weights
+        from rtmap_models.export.onnx_weights import read_weights
 
         state = read_weights(path)
         if state is None:

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from rtmap_models.answer import Answer, AnsweringNet
-from rtmap_models.backbone import PictureNet
 from rtmap_models.bev import BevWarp, normalize_picture
 from rtmap_models.config import TinyConfig
-from rtmap_models.decoder import Decoder, LayerOutput, attention_bias
-from rtmap_models.queries import (
+from rtmap_models.tiny.backbone import PictureNet
+from rtmap_models.tiny.decoder import Decoder, LayerOutput, attention_bias
+from rtmap_models.tiny.queries import (
     DenseProposals,
     FieldHead,
     PriorEncoder,
@@ -22,7 +22,7 @@ from rtmap_models.queries import (
 )
 
 if TYPE_CHECKING:
-    from rtmap_models.dataset import Batch
+    from rtmap_models.data.dataset import Batch
 
 
 class Prediction(NamedTuple):
@@ -108,6 +108,6 @@ class RTMapNet(AnsweringNet):
 
     def losses(self, batch: Batch, bf16: bool = False) -> dict[str, Tensor]:
         """The weighted parts of the loss by name; their sum is the loss."""
-        from rtmap_models.criterion import LossWeights, compute_losses
+        from rtmap_models.tiny.criterion import LossWeights, compute_losses
 
         return compute_losses(self.predict_batch(batch, bf16), batch, LossWeights())

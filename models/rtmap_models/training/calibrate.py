@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
 from rtmap_models.answer import Answer, AnsweringNet, Layers
-from rtmap_models.dataset import Batch, Frames, collate, make_sample
-from rtmap_models.matcher import Matcher
-from rtmap_models.samples import PriorNoise
+from rtmap_models.data.dataset import Batch, Frames, collate, make_sample
+from rtmap_models.data.samples import PriorNoise
+from rtmap_models.tiny.matcher import Matcher
 
 LAPLACE_80 = math.log(5.0)
 NORMAL_80 = 1.2816

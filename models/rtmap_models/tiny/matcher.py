@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from rtmap_models.dataset import Batch
-from rtmap_models.decoder import LayerOutput
+from rtmap_models.data.dataset import Batch
+from rtmap_models.tiny.decoder import LayerOutput
 
 POINT_WEIGHT, CLASS_WEIGHT = 0.6, 2.0
 FAR_M = 30.0

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rtmap_models.dataset import Batch
-from rtmap_models.decoder import LayerOutput
-from rtmap_models.matcher import Matcher
-from rtmap_models.network import Prediction
-from rtmap_models.queries import DenseProposals
+from rtmap_models.data.dataset import Batch
+from rtmap_models.tiny.decoder import LayerOutput
+from rtmap_models.tiny.matcher import Matcher
+from rtmap_models.tiny.network import Prediction
+from rtmap_models.tiny.queries import DenseProposals
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import nn
 
 from rtmap_cli.output import table
-from rtmap_models.example import example_inputs
+from rtmap_models.export.example import example_inputs
 
 INPUTS = ("images", "ego_to_image", "prior_points", "prior_class", "prior_mask")
 OUTPUTS = ("scores", "points", "sigma", "prior_score", "pose_delta", "pose_covariance")

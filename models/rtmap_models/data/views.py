@@ -14,8 +14,8 @@ from rtmap_cli.geometry.cameras import levelled
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_models.bev import BevWarp
 from rtmap_models.config import ModelConfig
-from rtmap_models.samples import Array, Scene
-from rtmap_models.shards import SCENE_MARGIN_M, window_half, window_size, write_shard
+from rtmap_models.data.samples import Array, Scene
+from rtmap_models.data.shards import SCENE_MARGIN_M, window_half, window_size, write_shard
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rtmap_models.config import ModelConfig
-from rtmap_models.generate import (
+from rtmap_models.data.generate import (
     FRAMES_PER_TOWN,
     TOWNS_PER_SEED,
     TownJob,

@@ -11,8 +11,8 @@ from typing import Any
 
 from rtmap_cli.errors import BadInput, UsageError
 from rtmap_models.config import CONFIGS
-from rtmap_models.dataset import Augmentation
-from rtmap_models.samples import PriorNoise
+from rtmap_models.data.dataset import Augmentation
+from rtmap_models.data.samples import PriorNoise
 
 TABLE = "training"
 

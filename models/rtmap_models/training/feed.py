@@ -12,8 +12,8 @@ from torch.utils.data import DataLoader, Dataset
 
 from rtmap_cli.errors import BadInput
 from rtmap_models.config import ModelConfig
-from rtmap_models.dataset import Batch, Frames, collate, make_sample
-from rtmap_models.recipe import Recipe
+from rtmap_models.data.dataset import Batch, Frames, collate, make_sample
+from rtmap_models.training.recipe import Recipe
 
 REFRESH_STEPS = 200
 """After so many steps the folders are looked at again: they may grow while training runs."""

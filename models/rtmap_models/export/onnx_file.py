@@ -16,11 +16,16 @@ from torch import nn
 
 from rtmap_cli.errors import Findings
 from rtmap_cli.tables import whole_file
-from rtmap_models.example import example_inputs
-from rtmap_models.gathers import spell_out_grid_samples
-from rtmap_models.half import to_half
-from rtmap_models.onnx_weights import CONFIG_KEY, keep_weights, read_configuration, read_weights
-from rtmap_models.parity import (
+from rtmap_models.export.example import example_inputs
+from rtmap_models.export.gathers import spell_out_grid_samples
+from rtmap_models.export.half import to_half
+from rtmap_models.export.onnx_weights import (
+    CONFIG_KEY,
+    keep_weights,
+    read_configuration,
+    read_weights,
+)
+from rtmap_models.export.parity import (
     HALF,
     INPUTS,
     OUTPUTS,
@@ -61,9 +66,9 @@ def export_onnx(
 
     ``network`` holds its configuration in ``.config``. ``metadata`` adds to what the configuration
     says (training data, licence, …). With ``half`` the file is a variant for GPUs, see
-    `rtmap_models.half`. Otherwise `read_weights` gives the network's state dict back from the
-    file. ParityMiss when the graph and torch differ by more than the tolerance: nothing is written
-    then.
+    `rtmap_models.export.half`. Otherwise `read_weights` gives the network's state dict back from
+    the file. ParityMiss when the graph and torch differ by more than the tolerance: then nothing is
+    written.
     """
     network = network.eval()
     model = _trace(network)
@@ -201,7 +206,7 @@ def _note(model: onnx.ModelProto, key: str, value: Any) -> None:
 def code_version() -> str:
     """SHA-256 (12 digits) of the sources of this package: says which code made a model."""
     digest = hashlib.sha256()
-    for source in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(source.relative_to(Path(__file__).parent).as_posix().encode())
+    for source in sorted(Path(__file__).parents[1].rglob("*.py")):
+        digest.update(source.relative_to(Path(__file__).parents[1]).as_posix().encode())
         digest.update(source.read_bytes())
     return digest.hexdigest()[:12]

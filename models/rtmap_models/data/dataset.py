@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rtmap_models.config import ModelConfig
-from rtmap_models.samples import (
+from rtmap_models.data.samples import (
     Array,
     Pieces,
     Prior,
@@ -26,7 +26,7 @@ from rtmap_models.samples import (
     rotation,
     segmentation_target,
 )
-from rtmap_models.shards import (
+from rtmap_models.data.shards import (
     SCENE_MARGIN_M,
     Frame,
     Frames,

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rtmap_models.config import TinyConfig
-from rtmap_models.queries import Queries
+from rtmap_models.tiny.queries import Queries
 
 NORMAL_OFFSET_M = 0.8
 """The fine map is read on the line and this far to its left and right."""

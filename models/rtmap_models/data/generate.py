@@ -27,9 +27,9 @@ from rtmap_cli.steps.simulate.worlds.heights import Ground, stand_on
 from rtmap_cli.steps.simulate.worlds.world import world_from_map
 from rtmap_cli.steps.simulate.worlds.world_objects import random_occluders
 from rtmap_models.config import ModelConfig
-from rtmap_models.rigs import sample_rig
-from rtmap_models.samples import Array
-from rtmap_models.views import Pictures, View, scene_at
+from rtmap_models.data.rigs import sample_rig
+from rtmap_models.data.samples import Array
+from rtmap_models.data.views import Pictures, View, scene_at
 
 FRAMES_PER_TOWN = 24
 TOWN_SIZES = (150.0, 220.0, 320.0)

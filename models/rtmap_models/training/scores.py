@@ -15,10 +15,10 @@ from scipy.optimize import minimize
 
 from rtmap_cli.maps.prior import DUPLICATE_M, on_prior
 from rtmap_models.answer import AnsweringNet
-from rtmap_models.calibrate import FOUND_M
-from rtmap_models.dataset import Batch, Frames, collate, make_sample
-from rtmap_models.decoder import LayerOutput
-from rtmap_models.samples import PriorNoise
+from rtmap_models.data.dataset import Batch, Frames, collate, make_sample
+from rtmap_models.data.samples import PriorNoise
+from rtmap_models.tiny.decoder import LayerOutput
+from rtmap_models.training.calibrate import FOUND_M
 
 Pairs = NDArray[np.float64]
 

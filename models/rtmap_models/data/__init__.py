@@ -1,0 +1,1 @@
+"""From towns and logs to frames on disk, and from frames to samples and batches."""

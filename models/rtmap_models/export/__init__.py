@@ -1,0 +1,1 @@
+"""From weights to one self-describing ONNX file, and back."""

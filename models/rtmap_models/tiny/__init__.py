@@ -1,0 +1,1 @@
+"""The default network: a bird's-eye picture first, then one refinement decoder."""
