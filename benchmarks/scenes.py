@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 TEST_SEED = 90_000_000
 """Towns from this seed on are neither trained nor calibrated with."""
 
+WEATHERS = 8
+
 ATTITUDE_DEG = 0.1
 """How well roll and pitch are known where a pose is not measured, standard deviation."""
 
@@ -97,17 +99,19 @@ class RealMap:
         self.rig = Rig(tuple(_fitted(c, config, lender.ground_z) for c in lender.rig))
 
     def drive(self, frames: int) -> Iterator[Shot]:
-        """Evenly chosen frames of the recorded drive, with its vehicles."""
+        """Evenly chosen frames of the recorded drive, with its vehicles, in turn under one of
+        `WEATHERS` weathers: a network may like one drive's light and not another's."""
         rng = np.random.default_rng(0)
-        style, drop = make_style(rng), np.eye(4)
+        styles, drop = [make_style(rng) for _ in range(WEATHERS)], np.eye(4)
         drop[2, 3] = self.log.ground_z
         recorded = list(self.log.frames())
         path = [frame.map_SE3_ego @ drop for frame in recorded]
         if self.flat:
             path = [_flattened(pose) for pose in path]
-        for k in np.linspace(0, len(recorded) - 1, frames).round().astype(int):
+        chosen = np.linspace(0, len(recorded) - 1, frames).round().astype(int)
+        for n, k in enumerate(chosen):
             boxes = [replace(o, z=o.z - self.log.ground_z) for o in recorded[k].occluders]
-            view, known = self._look(path[k], style, boxes, rng)
+            view, known = self._look(path[k], styles[n % WEATHERS], boxes, rng)
             yield Shot(view, known, path, self.vector_map)
 
     def random_places(self, frames: int) -> Iterator[Shot]:

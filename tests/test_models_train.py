@@ -200,3 +200,17 @@ def test_calibration_makes_sigmas_honest(weights: Path, frames: Path) -> None:
     for name, value in before.items():
         if name.startswith("sigma") and value not in (0.2, 5.0, 1.0):
             assert after[name] == pytest.approx(value * np.exp(-0.5), rel=0.1)
+
+
+def test_the_shipped_model_can_be_trained_on() -> None:
+    """Its weights, as read back from the ONNX file, are the ones that training goes on from."""
+    from rtmap_models.architecture import build_network
+    from rtmap_models.config import load_config
+    from rtmap_models.training.checkpoint import start_from
+
+    network = build_network(load_config("rtmap-tiny"))
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    assert start_from(network, "rtmap-tiny") == []
+    after = network.state_dict()
+    moved = [name for name, value in before.items() if not torch.equal(value, after[name])]
+    assert len(moved) > 0.8 * len([n for n in before if n.endswith(("weight", "running_mean"))])
