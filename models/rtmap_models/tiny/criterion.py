@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from rtmap_models.data.dataset import Batch
 from rtmap_models.tiny.decoder import LayerOutput
 from rtmap_models.tiny.matcher import Matcher
-from rtmap_models.tiny.network import Prediction
+from rtmap_models.tiny.prediction import Prediction
 from rtmap_models.tiny.queries import DenseProposals
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -11,9 +11,10 @@ from rtmap_models.answer import Answer, AnsweringNet
 from rtmap_models.bev import BevWarp, normalize_picture
 from rtmap_models.config import TinyConfig
 from rtmap_models.tiny.backbone import PictureNet
-from rtmap_models.tiny.decoder import Decoder, LayerOutput, attention_bias
+from rtmap_models.tiny.criterion import LossWeights, compute_losses
+from rtmap_models.tiny.decoder import Decoder, attention_bias
+from rtmap_models.tiny.prediction import Prediction
 from rtmap_models.tiny.queries import (
-    DenseProposals,
     FieldHead,
     PriorEncoder,
     ProposalHead,
@@ -23,16 +24,6 @@ from rtmap_models.tiny.queries import (
 
 if TYPE_CHECKING:
     from rtmap_models.data.dataset import Batch
-
-
-class Prediction(NamedTuple):
-    """Everything that training needs; queries are the new ones first, then the prior slots."""
-
-    layers: list[LayerOutput]
-    proposals: DenseProposals
-    segmentation: Tensor  # (B, C, H/2, W/2) logits
-    field: Tensor  # (B, C, 2, H/2, W/2) metres to the nearest element of the class
-    new_count: int
 
 
 class RTMapNet(AnsweringNet):
@@ -108,6 +99,4 @@ class RTMapNet(AnsweringNet):
 
     def losses(self, batch: Batch, bf16: bool = False) -> dict[str, Tensor]:
         """The weighted parts of the loss by name; their sum is the loss."""
-        from rtmap_models.tiny.criterion import LossWeights, compute_losses
-
         return compute_losses(self.predict_batch(batch, bf16), batch, LossWeights())

@@ -14,7 +14,8 @@ from rtmap_cli.geometry.poses import transform
 from rtmap_cli.logs.log import Camera, Occluder
 from rtmap_cli.steps.simulate.images.slopes import Terrain
 from rtmap_cli.steps.simulate.images.style import Style
-from rtmap_cli.steps.simulate.worlds.world_objects import CROWN, OBJECT_COLUMNS, objects_near
+from rtmap_cli.steps.simulate.worlds.roadside import CROWN, OBJECT_COLUMNS
+from rtmap_cli.steps.simulate.worlds.world_objects import objects_near
 
 if TYPE_CHECKING:
     from rtmap_cli.steps.simulate.worlds.world import World

@@ -13,7 +13,7 @@ from rtmap_cli.geometry.polylines import arc_length, is_ring, join_lines, normal
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.steps.simulate.worlds.heights import Ground, ground_of
 from rtmap_cli.steps.simulate.worlds.markings import arrows, rng_of, seams, stop_lines
-from rtmap_cli.steps.simulate.worlds.world_objects import roadside
+from rtmap_cli.steps.simulate.worlds.roadside import roadside
 
 Array = NDArray[np.float64]
 
