@@ -29,7 +29,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rtmap_cli.cli import run as rtmap
-from rtmap_cli.formats.av2_map import read_av2_archive, vector_map_of
+from rtmap_cli.formats.av2.vector_map import read_av2_archive, vector_map_of
 from rtmap_cli.logs.run import OUTDATED, Run, read_run
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import CLASSES

@@ -17,8 +17,8 @@ from rtmap_models.data.generate import TownStage, projections
 from rtmap_models.data.views import View, scene_at
 from scipy.spatial.transform import Rotation
 
-from rtmap_cli.formats.av2 import Av2Log
-from rtmap_cli.formats.av2_map import read_av2_archive, vector_map_of
+from rtmap_cli.formats.av2.log import Av2Log
+from rtmap_cli.formats.av2.vector_map import read_av2_archive, vector_map_of
 from rtmap_cli.geometry.cameras import fit_camera, levelled
 from rtmap_cli.geometry.poses import invert, se3_from_xyyaw
 from rtmap_cli.logs.log import Camera, Occluder, Rig

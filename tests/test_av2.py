@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from sample_logs import av2_archive, rewrite, truncate, write_archive, write_av2_log
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.formats.av2 import Av2Log, read_av2_map, thin
-from rtmap_cli.formats.av2_elements import dividers
-from rtmap_cli.formats.av2_map import read_av2_archive, vector_map_of
+from rtmap_cli.formats.av2.elements import dividers
+from rtmap_cli.formats.av2.log import Av2Log, read_av2_map, thin
+from rtmap_cli.formats.av2.vector_map import read_av2_archive, vector_map_of
 from rtmap_cli.geometry.polylines import length, resample
 from rtmap_cli.geometry.poses import se3_from_xyyaw, xyyaw_of
 from rtmap_cli.logs.log import Log

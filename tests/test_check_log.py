@@ -16,7 +16,7 @@ import pytest
 from sample_logs import jpeg, rewrite, truncate, write_av2_log, write_native_log
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.formats.av2_check import check_av2
+from rtmap_cli.formats.av2.check import check_av2
 from rtmap_cli.logs.check import check_native
 from rtmap_cli.logs.check_parts import Report, check_camera
 from rtmap_cli.logs.log import Camera

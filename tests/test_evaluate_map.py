@@ -103,7 +103,7 @@ def test_hand_checkable_cases(rtmap: Any, rtmap_golden: Path, tmp_path: Path) ->
 
 
 def test_crop_of_a_real_map_is_the_reference_truth(rtmap_golden: Path, av2_log: Path) -> None:
-    from rtmap_cli.formats.av2 import read_av2_map
+    from rtmap_cli.formats.av2.log import read_av2_map
     from rtmap_cli.formats.map_frames import read_map_frames
     from rtmap_cli.steps.evaluate.drives import read_drives
 

@@ -182,7 +182,7 @@ def test_tbv_logs_are_argoverse_logs_without_cuboids(
 
 
 def test_av2_images_have_their_own_poses(tmp_path: Path) -> None:
-    from rtmap_cli.formats.av2 import Av2Log
+    from rtmap_cli.formats.av2.log import Av2Log
 
     log = Av2Log(write_av2_log(tmp_path / "log"))
     frame = next(log.frames())

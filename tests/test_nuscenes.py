@@ -24,8 +24,8 @@ from sample_nuscenes import (
 )
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.formats.nuscenes import NuscenesLog, nuscenes_scenes
-from rtmap_cli.formats.nuscenes_tables import ORIGINS, location_crs
+from rtmap_cli.formats.nuscenes.log import NuscenesLog, nuscenes_scenes
+from rtmap_cli.formats.nuscenes.tables import ORIGINS, location_crs
 from rtmap_cli.formats.pickles import read_plain_pickle
 from rtmap_cli.logs.open import open_log
 from rtmap_cli.logs.run import read_run

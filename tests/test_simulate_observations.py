@@ -179,7 +179,7 @@ def test_with_a_prior_elements_are_matched_outdated_or_new(rtmap, tmp_path, worl
 
 
 def test_av2_routes_through_the_command_line(rtmap, tmp_path, av2_log):
-    from rtmap_cli.formats.av2_map import read_av2_map
+    from rtmap_cli.formats.av2.vector_map import read_av2_map
 
     write_new_map(read_av2_map(av2_log), tmp_path / "map", "av2")
     base = ("simulate", "observations", "--map", tmp_path / "map", "--log", f"av2:{av2_log}")

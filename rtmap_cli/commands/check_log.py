@@ -23,7 +23,7 @@ def command(context: click.Context, log: str, fast: bool, as_json: bool) -> None
     Example:
       rtmap check-log logs/monday
     """
-    from rtmap_cli.formats.av2_check import check_av2
+    from rtmap_cli.formats.av2.check import check_av2
     from rtmap_cli.logs.check import check_native
     from rtmap_cli.logs.check_frames import check_opened
     from rtmap_cli.logs.open import log_format

@@ -27,7 +27,7 @@ def command(log_dir: Path, output: Path, city: str | None, overwrite: bool, as_j
       rtmap import av2 av2/val/7fab2350-7eaf-3b7e-a39d-6937a4c1bede -o map
     """
     from rtmap_cli.errors import BadInput
-    from rtmap_cli.formats.av2_map import read_av2_archive, vector_map_of
+    from rtmap_cli.formats.av2.vector_map import read_av2_archive, vector_map_of
     from rtmap_cli.maps.element import CLASSES
     from rtmap_cli.maps.store import write_new_map
     from rtmap_cli.output import emit, log

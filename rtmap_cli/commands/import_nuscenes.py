@@ -29,7 +29,7 @@ def command(
       rtmap import nuscenes /data/nuscenes --location singapore-onenorth -o map
     """
     from rtmap_cli.errors import BadInput
-    from rtmap_cli.formats.nuscenes_map import read_expansion, vector_map_of
+    from rtmap_cli.formats.nuscenes.vector_map import read_expansion, vector_map_of
     from rtmap_cli.maps.crs import check_map_crs
     from rtmap_cli.maps.element import CLASSES
     from rtmap_cli.maps.store import write_new_map

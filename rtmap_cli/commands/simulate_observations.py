@@ -184,7 +184,7 @@ def _drive(
 ) -> tuple[Drive, dict[str, Any]]:
     """The true drive, and what run.json should say about where it comes from."""
     from rtmap_cli.errors import BadInput, UsageError
-    from rtmap_cli.formats.av2_map import read_av2_archive
+    from rtmap_cli.formats.av2.vector_map import read_av2_archive
     from rtmap_cli.logs.native import NativeLog
     from rtmap_cli.logs.open import log_format, open_log
     from rtmap_cli.steps.simulate.driving.drives import drive_of_log, drive_over_route

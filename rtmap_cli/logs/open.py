@@ -13,8 +13,8 @@ from rtmap_cli.errors import BadInput
 from rtmap_cli.logs.log import Log
 
 READERS = {
-    "av2": ("rtmap_cli.formats.av2", "Av2Log"),
-    "nuscenes": ("rtmap_cli.formats.nuscenes", "open_nuscenes"),
+    "av2": ("rtmap_cli.formats.av2.log", "Av2Log"),
+    "nuscenes": ("rtmap_cli.formats.nuscenes.log", "open_nuscenes"),
     "dgp": ("rtmap_cli.formats.dgp", "DgpLog"),
 }
 """Prefix of a log argument → module and class (or function) of its reader."""

@@ -113,7 +113,7 @@ def logs_in(spec: str) -> list[str]:
             raise
         return [log for p in found for log in logs_in(str(p))]
     if kind == "nuscenes" and "#" not in str(path) and path.is_dir():
-        from rtmap_cli.formats.nuscenes import nuscenes_scenes
+        from rtmap_cli.formats.nuscenes.log import nuscenes_scenes
 
         return [f"nuscenes:{path}#{scene}" for scene in nuscenes_scenes(path)]
     return [spec]
@@ -244,12 +244,12 @@ def _truth(job: LogJob, log: Log) -> VectorMap:
         return vector_map
     kind, _ = log_format(job.spec)
     if kind == "av2":
-        from rtmap_cli.formats.av2_map import read_av2_map
+        from rtmap_cli.formats.av2.vector_map import read_av2_map
 
         return read_av2_map(log.path)
     location = getattr(log, "location", None)
     if kind == "nuscenes" and location is not None:
-        from rtmap_cli.formats.nuscenes_map import read_nuscenes_map
+        from rtmap_cli.formats.nuscenes.vector_map import read_nuscenes_map
 
         return read_nuscenes_map(log.path, location)
     raise BadInput(log.path, "the log brings no map of its own", "pass --map with the true map")

@@ -160,7 +160,7 @@ def _frames_of(spec: str | Path) -> Drive:
 
 
 def _av2(spec: str | Path) -> Drive:
-    from rtmap_cli.formats.av2 import Av2Log
+    from rtmap_cli.formats.av2.log import Av2Log
 
     log = Av2Log(Path(str(spec).removeprefix("av2:")))
     return Drive(log.log_id, log.crs, log.pose_times, log.poses)

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from rtmap_cli.errors import NoAnswer
-from rtmap_cli.formats.av2_map import Av2Map
+from rtmap_cli.formats.av2.vector_map import Av2Map
 from rtmap_cli.geometry.polylines import arc_length, resample, resample_step
 from rtmap_cli.steps.simulate.perceiving.noise import generator
 

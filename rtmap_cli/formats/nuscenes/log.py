@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.formats.nuscenes_info import CAMERAS, NuscenesInfoLog, flat
-from rtmap_cli.formats.nuscenes_sweep import read_sweep_file
-from rtmap_cli.formats.nuscenes_tables import Record, Tables, location_crs, read_tables
+from rtmap_cli.formats.nuscenes.info import CAMERAS, NuscenesInfoLog, flat
+from rtmap_cli.formats.nuscenes.sweep import read_sweep_file
+from rtmap_cli.formats.nuscenes.tables import Record, Tables, location_crs, read_tables
 from rtmap_cli.formats.records import count_of, intrinsics_of, pose_of
 from rtmap_cli.geometry.poses import invert
 from rtmap_cli.logs.frames import POSE_SIGMA, FrameLog

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.formats.av2 import GROUND_Z
-from rtmap_cli.formats.av2_files import (
+from rtmap_cli.formats.av2.files import (
     POSES_FILE,
     RING_CAMERAS,
     find_city,
@@ -21,8 +20,9 @@ from rtmap_cli.formats.av2_files import (
     read_sweep,
     timed_files,
 )
-from rtmap_cli.formats.av2_ground import read_ground
-from rtmap_cli.formats.av2_map import read_av2_archive, vector_map_of
+from rtmap_cli.formats.av2.ground import read_ground
+from rtmap_cli.formats.av2.log import GROUND_Z
+from rtmap_cli.formats.av2.vector_map import read_av2_archive, vector_map_of
 from rtmap_cli.logs.check_parts import (
     Limited,
     Report,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.formats.av2_files import (
+from rtmap_cli.formats.av2.files import (
     OCCLUDING,
     RING_CAMERAS,
     Cuboids,
@@ -26,8 +26,8 @@ from rtmap_cli.formats.av2_files import (
     read_sweep,
     timed_files,
 )
-from rtmap_cli.formats.av2_ground import GroundHeight, read_ground
-from rtmap_cli.formats.av2_map import read_av2_archive, read_av2_map, vector_map_of
+from rtmap_cli.formats.av2.ground import GroundHeight, read_ground
+from rtmap_cli.formats.av2.vector_map import read_av2_archive, read_av2_map, vector_map_of
 from rtmap_cli.geometry.poses import interpolate, invert, yaw_of
 from rtmap_cli.logs.log import Frame, Occluder
 from rtmap_cli.logs.native import decode_image

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.formats.nuscenes_sweep import read_sweep_file
+from rtmap_cli.formats.nuscenes.sweep import read_sweep_file
 from rtmap_cli.formats.pickles import read_plain_pickle
 from rtmap_cli.formats.records import array, intrinsics_of, matrix_of, need
 from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, yaw_of

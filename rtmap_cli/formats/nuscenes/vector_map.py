@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.formats.nuscenes_tables import location_crs
+from rtmap_cli.formats.nuscenes.tables import location_crs
 from rtmap_cli.formats.records import need
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.tables import read_json

@@ -18,9 +18,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.formats.av2_elements import boundaries, crossings, dividers
-from rtmap_cli.formats.av2_files import find_city
-from rtmap_cli.formats.av2_ground import GroundHeight, read_ground
+from rtmap_cli.formats.av2.elements import boundaries, crossings, dividers
+from rtmap_cli.formats.av2.files import find_city
+from rtmap_cli.formats.av2.ground import GroundHeight, read_ground
 from rtmap_cli.maps.crs import city_code, city_crs
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.tables import read_json

@@ -1,7 +1,7 @@
 """The files of an Argoverse 2 log as they lie on disk: feather and JSON into arrays.
 
 Coordinates are those of the files: city frame for poses, ego frame for cuboids and sweeps, metres.
-``rtmap_cli.formats.av2`` brings them together in the UTM frame of the city.
+``rtmap_cli.formats.av2.log`` brings them together in the UTM frame of the city.
 """
 
 from __future__ import annotations

@@ -1,0 +1,1 @@
+"""Argoverse 2 and Trust-but-Verify logs and maps as they lie on disk."""
