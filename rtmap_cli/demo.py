@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -37,7 +38,7 @@ class Demo:
         from rtmap_cli.cli import run
 
         words = [str(a) for a in arguments]
-        self.say("  rtmap " + " ".join(w.replace(f"{self.folder}/", "") for w in words))
+        self.say("  rtmap " + shlex.join(w.replace(f"{self.folder}/", "") for w in words))
         out, err = io.StringIO(), io.StringIO()
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             code = run([*words, "--json"])
@@ -83,7 +84,7 @@ def run_demo(
     lines = [
         *table(header, rows),
         "",
-        "mAP of the map against the world along the drives, strict thresholds 0.2, 0.5, 1.0 m;",
+        "mAP of the map against the world along drive 1, strict thresholds 0.2, 0.5, 1.0 m;",
         f"changes found, missed, false out of {len(CHANGES)}; simulated images; {seconds:.0f} s.",
     ]
     lines += ["", *reported(demo)]

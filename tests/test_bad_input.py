@@ -174,3 +174,18 @@ def test_what_nobody_thought_of_is_still_one_line(
     monkeypatch.setenv("RTMAP_DEBUG", "1")
     with pytest.raises(ZeroDivisionError):
         rtmap("map", "log", town)
+
+
+def test_what_was_taken_for_a_run_is_told(rtmap, tmp_path: Path) -> None:
+    log, runs = tmp_path / "log", tmp_path / "runs"
+    log.mkdir()
+    (log / "log.json").write_text("{}")
+    (runs / "monday").mkdir(parents=True)
+    (runs / "monday" / "run.json").write_text("{}")
+    rtmap("simulate", "town", "--size", 150, "-o", tmp_path / "map")
+    taken = rtmap("localize", log, "--map", tmp_path / "map", code=3)
+    assert "it is a log: make a run of it with rtmap infer" in taken.err
+    held = rtmap("localize", runs, "--map", tmp_path / "map", code=3)
+    assert "it holds runs (monday): name them" in held.err
+    colon = ["simulate", "images", "--map", tmp_path / "map", "--log", "town", "-o", tmp_path / "x"]
+    assert "town: with a colon" in rtmap(*colon, code=3).err

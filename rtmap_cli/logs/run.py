@@ -522,11 +522,23 @@ def _rising(pair: Any) -> bool:
     )
 
 
+def _instead_of_run(folder: Path) -> str:
+    """What to do with a folder that was taken for a run."""
+    if (folder / "log.json").exists():
+        return "it is a log: make a run of it with rtmap infer"
+    inside = sorted(path.parent.name for path in folder.glob("*/run.json"))
+    if inside:
+        return f"it holds runs ({', '.join(inside[:3])}): name them"
+    return "make one with rtmap infer"
+
+
 def read_run_info(folder: str | Path) -> dict[str, Any]:
     """run.json of a run folder, checked."""
     folder = Path(folder)
     if not folder.is_dir():
         raise BadInput(folder, "no such run folder")
+    if not (folder / "run.json").exists():
+        raise BadInput(folder, "is no run (run.json is missing)", _instead_of_run(folder))
     info = read_json(folder / "run.json")
     if not isinstance(info, dict) or info.get("schema") != RUN_SCHEMA:
         raise BadInput(folder / "run.json", "not the run.json of an rtmap run")

@@ -66,6 +66,8 @@ def find_source(
         drive = town_drive(lanes, vector_map.crs, key, route.kind, route.length, route.spacing)
         drive = replace(drive, pose=stand_on(ground_of(vector_map), drive.pose))
         return Source(drive, None, 0.0, lanes)
+    if spec + ":" == TOWN:
+        raise BadInput(spec, "no such log folder", "write town: with a colon for lanes of the map")
     log = open_log(spec)
     check_same_crs(vector_map.crs, log.crs, map_path)
     drive = drive_of_log(log, _truth(log), 0.0)
