@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rtmap_cli.geometry.rings import open_ring
 from rtmap_cli.maps.existence import (
     VoteModel,
     drive_log_likelihoods,
@@ -16,6 +17,7 @@ from rtmap_cli.maps.existence import (
     stretches,
 )
 from rtmap_cli.maps.stations import assign, chains_of, loose_stretches, samples_of, stations_of
+from rtmap_cli.steps.detect_changes.crossings import Rings, features, match
 from rtmap_cli.steps.detect_changes.ridges import join_collinear, ridge_points, trace
 
 MODEL = VoteModel()
@@ -137,3 +139,19 @@ def test_ends_that_meet_at_a_corner_are_extended_to_it() -> None:
     joined = join_collinear([a, b], 3.0, 0.4, corner=4.0)
     assert len(joined) == 1
     assert np.hypot(*(joined[0] - [20.0, 0.0]).T).min() < 0.05
+
+
+def ring(x0: float, y0: float, x1: float, y1: float) -> np.ndarray:
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+
+
+def test_a_sliver_of_a_crossing_is_that_crossing() -> None:
+    """The range may cut all but a corner off: far from the centre, small against the whole."""
+    places = np.stack([open_ring(ring(0, 0, 4, 16)), open_ring(ring(30, 0, 34, 16))])
+    pieces = [ring(0.2, 14.8, 2, 15.9), ring(12, 2, 16, 14), ring(31, 0.5, 33, 15)]
+    points = np.stack([open_ring(p) for p in pieces])
+    n = len(points)
+    rings = Rings(
+        points, np.ones(n), np.ones(n), np.zeros(n, int), np.ones(n, bool), features(points)
+    )
+    assert match(rings, places).tolist() == [0, -1, 1]

@@ -63,6 +63,14 @@ def overlap(a: object, b: object) -> float:
     return float(shapely.area(shapely.intersection(a, b)) / union) if union > 0 else 0.0
 
 
+def inside(a: object, b: object) -> float:
+    """Share of the area of shapely polygon ``a`` that lies in ``b``."""
+    import shapely
+
+    area = shapely.area(a)
+    return float(shapely.area(shapely.intersection(a, b)) / area) if area > 0 else 0.0
+
+
 def polygon(ring: Array) -> object:
     """A valid shapely polygon of a ring, which may cross itself slightly."""
     import shapely

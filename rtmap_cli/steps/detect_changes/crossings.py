@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.rings import RING_POINTS, align, open_ring, overlap, polygon
+from rtmap_cli.geometry.rings import RING_POINTS, align, inside, open_ring, overlap, polygon
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.visibility import Views, views
 from rtmap_cli.steps.detect_changes.votes import (
@@ -26,6 +26,8 @@ NEAR = 3.5
 """Rings whose features (centre, direction) differ by more than this (m) are different ones."""
 VISIBLE = 0.65
 """A ring is in view of a frame when this share of its outline and middle is."""
+INSIDE = 0.6
+"""A detection with this share of its area in a known ring is a piece of that ring."""
 RING_MARGIN = 0.5
 """Border of the range (m) in which the outline does not count as looked at."""
 
@@ -82,7 +84,8 @@ def match(rings: Rings, places: Array, near: float = NEAR) -> Int:
     """(n,) index of the place (m, 80, 2) that each detection belongs to, or -1.
 
     The nearest in the feature space; a detection cut by the range may also overlap the place
-    by 15 % of the union, because its centre is not the centre of the element.
+    by 15 % of the union, or lie in it with `INSIDE` of its own area, because its centre is not the
+    centre of the element.
     """
     from scipy.spatial import cKDTree
 
@@ -103,8 +106,9 @@ def match(rings: Rings, places: Array, near: float = NEAR) -> Int:
             continue
         shape = polygon(rings.points[k])
         shares = [overlap(shape, shapes[j]) for j in close]
-        if max(shares) >= 0.15:
-            out[k] = close[int(np.argmax(shares))]
+        within = [inside(shape, shapes[j]) for j in close]
+        if max(shares) >= 0.15 or max(within) >= INSIDE:
+            out[k] = close[int(np.argmax(within))]
     return out
 
 
