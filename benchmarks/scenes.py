@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from rtmap_models.config import ModelConfig
 from rtmap_models.data.generate import TownStage, projections
 from rtmap_models.data.views import View, scene_at
-from scipy.spatial.transform import Rotation
 
 from rtmap_cli.formats.av2.log import Av2Log
 from rtmap_cli.formats.av2.vector_map import read_av2_archive, vector_map_of
@@ -25,6 +24,7 @@ from rtmap_cli.logs.log import Camera, Occluder, Rig
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.infer.levelling import RoadUnder
+from rtmap_cli.steps.simulate.images.drive_images import leaned
 from rtmap_cli.steps.simulate.images.render import body_motion, render_cameras
 from rtmap_cli.steps.simulate.images.style import Style, make_style
 from rtmap_cli.steps.simulate.worlds.heights import Ground, level, stand_on
@@ -37,9 +37,6 @@ TEST_SEED = 90_000_000
 """Towns from this seed on are neither trained nor calibrated with."""
 
 WEATHERS = 8
-
-ATTITUDE_DEG = 0.1
-"""How well roll and pitch are known where a pose is not measured, standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,7 @@ def unseen_towns(config: ModelConfig, towns: int, frames: int) -> Iterator[Shot]
         for _ in range(frames):
             view = stage.look()
             path = _along(stage.lanes, view.map_SE3_ego, stage.world.ground)
-            yield Shot(view, _leaned(view.map_SE3_ego, rng), path, stage.town.vector_map)
+            yield Shot(view, leaned(view.map_SE3_ego[None], rng)[0], path, stage.town.vector_map)
 
 
 class RealMap:
@@ -141,7 +138,7 @@ class RealMap:
         )
         scene = scene_at(self.index, pose, self.config)
         view = View(np.stack(images), projections(self.rig), scene, pose @ body)
-        return view, _leaned(view.map_SE3_ego, rng)
+        return view, leaned(view.map_SE3_ego[None], rng)[0]
 
 
 def _without_heights(vector_map: VectorMap) -> VectorMap:
@@ -187,11 +184,3 @@ def _along(lanes: Sequence[Array], pose: Array, ground: Ground | None) -> list[A
     near = lane[np.hypot(*(lane[:, :2] - here).T) < 36.0, :2]
     flat = se3_from_xyyaw(near[:, 0], near[:, 1], np.zeros(len(near)))
     return [pose, *stand_on(ground, flat)]
-
-
-def _leaned(pose: Array, rng: np.random.Generator) -> Array:
-    """The pose with roll and pitch as a vehicle knows them."""
-    out = pose.copy()
-    lean = np.radians(rng.normal(0, ATTITUDE_DEG, 3) * [1, 1, 0])
-    out[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(lean).as_matrix()
-    return out

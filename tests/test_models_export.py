@@ -11,45 +11,28 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed (extra: train)")
+pytest.importorskip("cv2", reason="opencv is not installed (extra: train)")
 pytest.importorskip("onnxscript", reason="onnxscript is not installed (extra: train)")
 
 import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
 from rtmap_models.architecture import build_network  # noqa: E402
-from rtmap_models.config import CONFIGS, load_config  # noqa: E402
+from rtmap_models.config import load_config  # noqa: E402
 from rtmap_models.export import onnx_file  # noqa: E402
 from rtmap_models.export.gathers import spell_out_grid_samples  # noqa: E402
 from rtmap_models.export.onnx_file import read_configuration, read_weights  # noqa: E402
 from rtmap_models.training.checkpoint import load_network, save_checkpoint  # noqa: E402
+from training_frames import tiny_config  # noqa: E402
 
 from rtmap_cli.errors import BadInput  # noqa: E402
 from rtmap_cli.steps.infer import find_model  # noqa: E402
-
-SMALL = {
-    "cell_m = 0.25": "cell_m = 0.75",
-    "supersample = 2": "supersample = 1",
-    "[24, 48, 96, 128]": "[8, 8, 16, 16]",
-    "fine_width = 24": "fine_width = 8",
-    "coarse_width = 64": "coarse_width = 16",
-    "query_width = 128": "query_width = 32",
-    "point_width = 48": "point_width = 16",
-    "layers = 3": "layers = 1",
-    "new_queries = 50": "new_queries = 12",
-    "[128, 224]": "[32, 48]",
-    'name = "rtmap-tiny"': 'name = "rtmap-test"',
-}
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint of a small network with every parameter and statistic away from its start."""
     folder = tmp_path_factory.mktemp("weights")
-    text = (CONFIGS / "rtmap-tiny.toml").read_text()
-    for old, new in SMALL.items():
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "small.toml").write_text(text)
-    config = load_config(folder / "small.toml")
+    config = load_config(tiny_config(folder))
     torch.manual_seed(0)
     network = build_network(config)
     with torch.no_grad():

@@ -9,8 +9,6 @@ statistics (training from scratch), "frozen" keeps those that were loaded and th
 
 from __future__ import annotations
 
-import pickle
-import struct
 from pathlib import Path
 
 import torch
@@ -18,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rtmap_cli.errors import BadInput
+from rtmap_models.tensors import read_tensors
 
 BLOCKS = {"resnet18": (2, 2, 2, 2), "resnet50": (3, 4, 6, 3)}
 
@@ -162,21 +161,8 @@ def load_backbone(network: nn.Module, path: Path) -> None:
 
 
 def _read_state(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise BadInput(path, "no such file", "give a state dict of torchvision's ResNet")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (
-        RuntimeError,
-        ValueError,
-        LookupError,
-        EOFError,
-        OSError,
-        pickle.PickleError,
-        struct.error,
-    ) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BadInput(path, f"not a state dict: {first}", "save it with torch.save") from error
+    todo = "give a state dict of torchvision's ResNet"
+    content = read_tensors(path, "a state dict", todo, "save it with torch.save")
     for key in ("state_dict", "model"):
         if isinstance(content, dict) and isinstance(content.get(key), dict):
             content = content[key]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from rtmap_cli.errors import BadInput
 from rtmap_cli.tables import whole_file
 from rtmap_models.architecture import build_network
 from rtmap_models.config import ModelConfig, config_from_dict
+from rtmap_models.tensors import read_tensors
 
 FORMAT = "rtmap.weights/1"
 
@@ -27,21 +26,8 @@ def save_checkpoint(path: Path, config: ModelConfig, content: dict[str, Any]) ->
 
 def load_checkpoint(path: Path) -> tuple[ModelConfig, dict[str, Any]]:
     """Read a checkpoint; BadInput when it is missing, damaged or not one of rtmap's."""
-    if not path.is_file():
-        raise BadInput(path, "no such file", "give the weights that rtmap train wrote")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (
-        RuntimeError,
-        ValueError,
-        LookupError,
-        EOFError,
-        OSError,
-        pickle.PickleError,
-        struct.error,
-    ) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BadInput(path, f"not a checkpoint: {first}", "train again") from error
+    todo = "give the weights that rtmap train wrote"
+    content = read_tensors(path, "a checkpoint", todo, "train again")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise BadInput(path, "not a checkpoint of rtmap train", f"expected format {FORMAT}")
     config = content.get("config")

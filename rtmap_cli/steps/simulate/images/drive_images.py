@@ -64,9 +64,8 @@ def on_springs(path: Drive, source: Source, key: DriveKey) -> Drive:
     return replace(path, pose=np.stack([pose @ body_motion(style, rng) for pose in path.pose]))
 
 
-def _leaned(poses: Array, key: DriveKey) -> Array:
-    """Poses whose roll and pitch are known to `ATTITUDE_DEG`."""
-    rng = generator(*key.drive, "attitude")
+def leaned(poses: Array, rng: np.random.Generator) -> Array:
+    """Poses (n, 4, 4) whose roll and pitch are known to `ATTITUDE_DEG`."""
     about = np.radians(rng.normal(0.0, ATTITUDE_DEG, (len(poses), 3)) * [1, 1, 0])
     out = poses.copy()
     out[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(about).as_matrix()
@@ -76,7 +75,7 @@ def _leaned(poses: Array, key: DriveKey) -> Array:
 def frames_of(path: Drive, key: DriveKey) -> Iterator[Frame]:
     """What the vehicle knows: rough poses with their sigmas, odometry, boxes."""
     known = initial_poses(path, Preset(), key)
-    initial = _leaned(known.initial, key)
+    initial = leaned(known.initial, generator(*key.drive, "attitude"))
     for k in range(len(path)):
         measured = bool(np.isfinite(known.odometry[k]).all())
         yield Frame(
