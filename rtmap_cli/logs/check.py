@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -39,8 +37,6 @@ from rtmap_cli.logs.tables import (
 from rtmap_cli.maps.crs import check_log_crs
 from rtmap_cli.tables import TableSchema, read_json
 
-T = TypeVar("T")
-
 
 def check_native(folder: Path, fast: bool = False) -> Report:
     """Check every file of a native log; ``fast`` does not decode images.
@@ -61,24 +57,15 @@ def check_native(folder: Path, fast: bool = False) -> Report:
     return report
 
 
-def _attempt(report: Report, call: Callable[[], T]) -> T | None:
-    """The result of a reader, or None after its BadInput became a finding."""
-    try:
-        return call()
-    except BadInput as error:
-        report.bad(error)
-        return None
-
-
 def _table(
     report: Report, name: str, schema: TableSchema, may_be_null: tuple[str, ...] = ()
 ) -> pa.Table | None:
-    return _attempt(report, lambda: load(report.folder / name, schema, may_be_null))
+    return report.attempt(lambda: load(report.folder / name, schema, may_be_null))
 
 
 def _check_info(report: Report) -> str | None:
     """log.json; the CRS when it can carry the poses."""
-    info = _attempt(report, lambda: read_log_info(report.folder))
+    info = report.attempt(lambda: read_log_info(report.folder))
     if info is None:
         return None
     path = report.folder / "log.json"
@@ -88,7 +75,7 @@ def _check_info(report: Report) -> str | None:
         report.warning(
             path, f"the road lies {info['ground_z']:g} m above the ego origin", "is ground_z right?"
         )
-    return _attempt(report, lambda: check_log_crs(str(info["crs"]), path))
+    return report.attempt(lambda: check_log_crs(str(info["crs"]), path))
 
 
 def _check_rig(report: Report) -> Rig | None:
@@ -99,7 +86,7 @@ def _check_rig(report: Report) -> Rig | None:
         else:
             report.warning(path, "no calibration: the log has no cameras")
         return None
-    rig = _attempt(report, lambda: rig_of_table(load(path, RIG), path))
+    rig = report.attempt(lambda: rig_of_table(load(path, RIG), path))
     for camera in rig or ():
         check_camera(report, path, camera)
     if rig is not None and not len(rig):
@@ -249,8 +236,8 @@ def _check_occluders(report: Report, times: dict[int, int] | None) -> None:
 def _check_truth(report: Report, times: dict[int, int] | None) -> None:
     folder = report.folder / "truth"
     if (folder / "changes.json").exists():
-        _attempt(report, lambda: read_json(folder / "changes.json"))
+        report.attempt(lambda: read_json(folder / "changes.json"))
     path = folder / "poses.parquet"
-    poses = _attempt(report, lambda: read_poses(path)) if path.exists() else None
+    poses = report.attempt(lambda: read_poses(path)) if path.exists() else None
     if poses is not None and times is not None and set(poses.frame.tolist()) != set(times):
         report.warning(path, "its frames are not those of frames.parquet")

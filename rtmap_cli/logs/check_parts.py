@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,9 @@ class Finding:
         return asdict(self)
 
 
+T = TypeVar("T")
+
+
 @dataclass
 class Report:
     """Collects findings about the log in ``folder``."""
@@ -64,6 +68,14 @@ class Report:
     def bad(self, error: BadInput) -> None:
         """What a reader refused."""
         self.error(error.where, error.what, error.todo)
+
+    def attempt(self, call: Callable[[], T]) -> T | None:
+        """The result of a reader, or None after its BadInput became a finding."""
+        try:
+            return call()
+        except BadInput as error:
+            self.bad(error)
+            return None
 
     def rows(self, file: Path, bad: Any, what: str, todo: str = "", name: str = "row") -> None:
         """An error with the first rows of a mask, and how many there are."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +33,6 @@ from rtmap_cli.maps.crs import city_crs
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
-T = TypeVar("T")
 
 
 def check_av2(folder: Path, fast: bool = False) -> Report:
@@ -56,17 +53,9 @@ def check_av2(folder: Path, fast: bool = False) -> Report:
     return report
 
 
-def _attempt(report: Report, call: Callable[[], T]) -> T | None:
-    try:
-        return call()
-    except BadInput as error:
-        report.bad(error)
-        return None
-
-
 def _check_poses(report: Report) -> tuple[Times | None, Array | None]:
     path = report.folder / POSES_FILE
-    raw = _attempt(report, lambda: read_poses_raw(report.folder))
+    raw = report.attempt(lambda: read_poses_raw(report.folder))
     if raw is None:
         return None, None
     times, quaternion, position = raw
@@ -79,7 +68,7 @@ def _check_poses(report: Report) -> tuple[Times | None, Array | None]:
 def _check_rig(report: Report) -> Rig | None:
     folder = report.folder / "calibration"
     found = len(report.findings)
-    rig = _attempt(report, lambda: read_rig(report.folder))
+    rig = report.attempt(lambda: read_rig(report.folder))
     if rig is None and len(report.findings) == found:
         report.warning(folder, "no calibration of ring cameras: the log has no rig")
     for camera in rig or ():
@@ -110,7 +99,7 @@ def _check_images(report: Report, rig: Rig | None, times: Times | None, fast: bo
 
 def _check_annotations(report: Report, times: Times | None) -> None:
     before = len(report.findings)
-    cuboids = _attempt(report, lambda: read_cuboids(report.folder))
+    cuboids = report.attempt(lambda: read_cuboids(report.folder))
     path = report.folder / "annotations.feather"
     if cuboids is None:
         if len(report.findings) == before:
@@ -141,7 +130,7 @@ def _check_map(report: Report, times: Times | None, poses: Array | None) -> None
     """Vector map and raster, and whether the vehicle drives on them."""
     folder = report.folder / "map"
     before = len(report.findings)
-    city = _attempt(report, lambda: find_city(report.folder))
+    city = report.attempt(lambda: find_city(report.folder))
     if city is None:
         if len(report.findings) == before:
             report.error(folder, "no map file names the city", "keep the map folder of the log")
@@ -149,11 +138,11 @@ def _check_map(report: Report, times: Times | None, poses: Array | None) -> None
     if not list(folder.glob("log_map_archive_*.json")):
         report.warning(folder, "no vector map: import av2 has nothing to read")
     else:
-        archive = _attempt(report, lambda: read_av2_archive(report.folder))
+        archive = report.attempt(lambda: read_av2_archive(report.folder))
         if archive is not None and not len(vector_map_of(archive)):
             report.warning(archive.path, "holds no crossing, painted line or drivable area")
     origin = city_crs(city)[1]
-    ground = _attempt(report, lambda: read_ground(report.folder, origin))
+    ground = report.attempt(lambda: read_ground(report.folder, origin))
     if ground is None or poses is None:
         return
     height = ground.at(poses[:, :2, 3] + origin) - poses[:, 2, 3]
