@@ -84,6 +84,7 @@ class Sample:
     offset: Array
     images: NDArray[np.uint8] | None = None
     ego_to_image: NDArray[np.float32] | None = None
+    plane: Array | None = None
 
 
 @dataclass
@@ -109,6 +110,7 @@ class Batch:
     cells: Tensor  # (M, 5) sample, class, row, column, truth
     images: Tensor | None = None  # (B, N, H, W, 3) uint8; an absent camera is zero
     ego_to_image: Tensor | None = None  # (B, N, 3, 4) float32; an absent camera is zero
+    plane: Tensor | None = None  # (B, 3) the road z = a x + b y + c there, NaN where unknown
 
     def to(self, device: torch.device | str) -> Batch:
         """The batch with every tensor on a device (numpy fields stay)."""
@@ -150,7 +152,9 @@ def augment(
     if frame.images is None or frame.ego_to_image is None:
         return moved
     images, projections = _moved_cameras(frame.images, frame.ego_to_image, inverse, shift)
-    return moved._replace(images=images, ego_to_image=projections)
+    return moved._replace(
+        images=images, ego_to_image=projections, plane=_moved_plane(frame.plane, inverse, shift)
+    )
 
 
 def _moved_picture(
@@ -175,6 +179,13 @@ def _moved_cameras(
         images = np.ascontiguousarray(images[:, :, ::-1])
         out[:, 0] = (images.shape[2] - 1) * out[:, 2] - out[:, 0]
     return images, out.astype(np.float32)
+
+
+def _moved_plane(plane: Array | None, inverse: Array, shift: Array) -> Array | None:
+    if plane is None:
+        return None
+    slopes = plane[:2] @ inverse
+    return np.array([*slopes, plane[2] - slopes @ shift])
 
 
 def recoloured(images: NDArray[np.uint8], gain: Array, offset: Array) -> NDArray[np.uint8]:
@@ -224,6 +235,7 @@ def make_sample(
         offset,
         frame.images,
         frame.ego_to_image,
+        frame.plane,
     )
 
 
@@ -276,6 +288,7 @@ def collate(samples: list[Sample], config: ModelConfig) -> Batch:
     offset = torch.from_numpy(np.stack([s.offset for s in samples])).float()[..., None, None]
     colour = (picture[:, :3] - 110) * gain + 110 + offset
     images, ego_to_image = _stacked_cameras(samples)
+    planes = [np.full(3, np.nan) if s.plane is None else s.plane for s in samples]
     tensor = torch.from_numpy
     return Batch(
         picture=torch.cat([colour, picture[:, 3:]], dim=1),
@@ -297,4 +310,5 @@ def collate(samples: list[Sample], config: ModelConfig) -> Batch:
         cells=tensor(np.concatenate(cells).astype(np.int64)),
         images=images,
         ego_to_image=ego_to_image,
+        plane=tensor(np.array(planes, np.float32)),
     )

@@ -5,7 +5,8 @@ A folder holds shards; a shard is a few files that appear whole:
 ``NAME.npy``         uint8 (n, rows, columns, 4) bird's-eye pictures, wider than the range so that
                      they can be turned and shifted
 ``NAME.images.npy``  uint8 (n, N, H, W, 3) camera images (optional; networks that look at them)
-``NAME.npz``         the elements of each frame; with images, their projections (n, N, 3, 4)
+``NAME.npz``         the elements of each frame; with images, their projections (n, N, 3, 4) and the
+                     road's plane in them (n, 3), NaN where unknown
 ``NAME.json``        written last: says what the others are
 """
 
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from rtmap_cli.errors import BadInput
 from rtmap_cli.tables import whole_file
 from rtmap_models.config import ModelConfig
-from rtmap_models.data.samples import Scene
+from rtmap_models.data.samples import Array, Scene
 
 WINDOW_MARGIN_M = (6.0, 8.0)
 """How much the cached picture is wider than the range on each side, x and y."""
@@ -36,13 +37,15 @@ class Frame(NamedTuple):
 
     ``picture`` uint8 (rows, columns, 4), the wide bird's-eye picture; ``scene`` the elements around
     the vehicle; ``images`` uint8 (N, H, W, 3) and ``ego_to_image`` float32 (N, 3, 4) where kept: an
-    absent camera is zero in both.
+    absent camera is zero in both; ``plane`` (3,) the road z = a x + b y + c in the frame that they
+    project from, where known: what levelling left.
     """
 
     picture: NDArray[np.uint8]
     scene: Scene
     images: NDArray[np.uint8] | None = None
     ego_to_image: NDArray[np.float32] | None = None
+    plane: Array | None = None
 
 
 def window_half(config: ModelConfig) -> tuple[float, float]:
@@ -72,6 +75,7 @@ def write_shard(
     info: dict[str, Any],
     images: NDArray[np.uint8] | None = None,
     ego_to_image: NDArray[np.float32] | None = None,
+    plane: Array | None = None,
 ) -> None:
     """Write one shard of `Frame` parts stacked along a first axis; readers see it when its JSON
     file is there."""
@@ -83,9 +87,8 @@ def write_shard(
             np.save(stream, array, allow_pickle=False)
     counts = [len(s.classes) for s in scenes]
     lengths = [np.diff(s.offsets) for s in scenes]
-    extra: dict[str, Any] = (
-        {} if ego_to_image is None else {"ego_to_image": ego_to_image.astype("f4")}
-    )
+    kept = {"ego_to_image": ego_to_image, "plane": plane}
+    extra: dict[str, Any] = {k: v.astype("f4") for k, v in kept.items() if v is not None}
     with whole_file(folder / f"{name}.npz") as path, path.open("wb") as stream:
         np.savez(
             stream,
@@ -109,7 +112,7 @@ class _Shard:
             self.pictures = np.load(self.path, mmap_mode="r", allow_pickle=False)
             with np.load(folder / f"{name}.npz", allow_pickle=False) as data:
                 self.table = {k: data[k] for k in ("frame", "length", "classes", "points")}
-                self.projections = data.get("ego_to_image")
+                self.projections, self.planes = data.get("ego_to_image"), data.get("plane")
             self.images = None
             if config.needs_images and images.exists():
                 self.images = np.load(images, mmap_mode="r", allow_pickle=False)
@@ -150,7 +153,8 @@ class _Shard:
         picture = np.asarray(self.pictures[row])
         if self.images is None or self.projections is None:
             return Frame(picture, scene)
-        return Frame(picture, scene, np.asarray(self.images[row]), self.projections[row])
+        plane = None if self.planes is None else self.planes[row].astype(np.float64)
+        return Frame(picture, scene, np.asarray(self.images[row]), self.projections[row], plane)
 
 
 class Frames:

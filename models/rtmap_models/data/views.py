@@ -27,7 +27,7 @@ class View:
     ego_to_image: NDArray[np.float32]
     scene: Scene
     map_SE3_ego: Array
-    plane: Array | None = None  # (3,) the road z = a x + b y + c in the ego frame, where known
+    plane: Array | None = None  # (3,) the road z = a x + b y + c in that frame, where known
 
 
 def scene_at(index: MapIndex, pose: Array, config: ModelConfig) -> Scene:
@@ -74,7 +74,8 @@ class Pictures:
         """Make the picture of one more view."""
         if view.plane is not None:
             plane = view.plane + self.rng.normal(0.0, 1.0, 3) * LEFT_PLANE
-            view = replace(view, ego_to_image=levelled(view.ego_to_image, plane).astype("f4"))
+            cameras = levelled(view.ego_to_image, plane).astype("f4")
+            view = replace(view, ego_to_image=cameras, plane=view.plane - plane)
         self.views.append(view)
         self.pictures.append(wide_picture(self.warp, view))
 
@@ -84,5 +85,7 @@ class Pictures:
         if self.keep_images:
             kept["images"] = np.stack([v.images for v in self.views])
             kept["ego_to_image"] = np.stack([v.ego_to_image for v in self.views])
+            unknown = np.full(3, np.nan)
+            kept["plane"] = np.stack([unknown if v.plane is None else v.plane for v in self.views])
         scenes = [v.scene for v in self.views]
         write_shard(folder, name, np.stack(self.pictures), scenes, info, **kept)
