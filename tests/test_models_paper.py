@@ -16,6 +16,7 @@ pytest.importorskip("onnxscript", reason="onnxscript is not installed (extra: tr
 cv2 = pytest.importorskip("cv2", reason="opencv is not installed (extra: train)")
 
 from rtmap_models.architecture import build_network  # noqa: E402
+from rtmap_models.cameras import project, read_maps  # noqa: E402
 from rtmap_models.config import CONFIGS, PaperConfig, config_from_dict, load_config  # noqa: E402
 from rtmap_models.data.dataset import Batch, Frame, collate, make_sample, window_size  # noqa: E402
 from rtmap_models.data.samples import PriorNoise, Scene  # noqa: E402
@@ -30,7 +31,7 @@ from rtmap_models.paper.criterion import (  # noqa: E402
     pose_loss,
 )
 from rtmap_models.paper.encoders import CameraEncoder  # noqa: E402
-from rtmap_models.paper.lift import CameraLift, project  # noqa: E402
+from rtmap_models.paper.lift import CameraLift  # noqa: E402
 from rtmap_models.paper.pose import LearnedPose  # noqa: E402
 from rtmap_models.paper.prediction import PaperPrediction  # noqa: E402
 from rtmap_models.paper.resnet import ResNet, load_backbone  # noqa: E402
@@ -299,7 +300,8 @@ def test_lift_reads_where_calibration_says() -> None:
     v, u = torch.meshgrid(torch.arange(h) * stride, torch.arange(w) * stride, indexing="ij")
     camera = torch.arange(5.0)[:, None, None].expand(-1, h, w)
     own = torch.stack([u.float().expand(5, -1, -1), v.float().expand(5, -1, -1), camera], dim=1)
-    read = lift._read(own[None], samples := lift._choose(projections, h, w))[0]
+    samples = lift._choose(projections, h, w)
+    read = read_maps(own[None], samples.camera, samples.column, samples.row)[0]
     pu, pv, _ = (x[0] for x in project(lift.points, projections))
     rows, columns = config.bev_size
     seen = samples.seen[0, 0] > 0

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from rtmap_models.cameras import project
 from rtmap_models.config import PaperConfig
 from rtmap_models.data.dataset import Batch
 from rtmap_models.paper.assign import ALPHA, Assigner, jobs_of, many_jobs
-from rtmap_models.paper.lift import project
 from rtmap_models.paper.prediction import PaperPrediction
 from rtmap_models.tiny.decoder import LayerOutput
 from rtmap_models.tiny.matcher import Matches

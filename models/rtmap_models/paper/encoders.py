@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rtmap_cli.errors import BadInput
+from rtmap_models.cameras import camera_features
 from rtmap_models.config import PaperConfig
 from rtmap_models.data.dataset import Batch
 from rtmap_models.paper.lift import CameraLift
@@ -64,18 +65,12 @@ class CameraEncoder(nn.Module):
         """From a training batch; absent cameras do not reach the batch's statistics."""
         if batch.images is None or batch.ego_to_image is None:
             raise BadInput("frames", "they hold no camera images", "make them for this --config")
-        present = batch.ego_to_image.abs().amax(dim=(2, 3)) > 0
-        if not self.training or bool(present.all()):
-            return self(batch.images, batch.ego_to_image)
-        some = self._image_features(batch.images[present])
-        features = some.new_zeros(*present.shape, *some.shape[1:])
-        features[present] = some
-        return self._lifted(features, batch.ego_to_image)
+        return self(batch.images, batch.ego_to_image)
 
     def forward(self, images: Tensor, ego_to_image: Tensor) -> Encoded:
         """``images`` uint8 (B, N, H, W, 3), ``ego_to_image`` (B, N, 3, 4)."""
-        features = self._image_features(images.flatten(0, 1))
-        return self._lifted(features.reshape(*images.shape[:2], *features.shape[1:]), ego_to_image)
+        features = camera_features(self._image_features, images, ego_to_image, self.training)
+        return self._lifted(features, ego_to_image)
 
     def _image_features(self, images: Tensor) -> Tensor:
         """uint8 (M, H, W, 3) → (M, image_width, H / stride, W / stride)."""

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from rtmap_models.bev import MIN_DEPTH, cell_centres
+from rtmap_models.bev import cell_centres
+from rtmap_models.cameras import at, best_views, read_maps
 from rtmap_models.config import PaperConfig
 from rtmap_models.tiny.decoder import BLOCKED
 
@@ -30,21 +30,6 @@ class Samples(NamedTuple):
     row: Tensor
     seen: Tensor  # 1 = the camera sees the point
     geometry: Tensor  # (B, S, K, 3): margin to the rim, distance, height
-
-
-def project(points: Tensor, ego_to_image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels u, v and depth (B, N, K) of ego points (3, K) m in cameras (B, N, 3, 4)."""
-    e = ego_to_image[..., None].float()
-    x, y, z = points
-    u, v, depth = (e[:, :, k, 0] * x + e[:, :, k, 1] * y + e[:, :, k, 2] * z + e[:, :, k, 3]
-                   for k in range(3))  # fmt: skip
-    inverse = 1.0 / depth.clamp(min=0.1)
-    return u * inverse, v * inverse, depth
-
-
-def at(pixel: Tensor, stride: int, cells: int) -> Tensor:
-    """Pixels → -1 … 1 of a feature map of so many cells, whose cell i lies at pixel stride · i."""
-    return (pixel / stride + 0.5) * (2.0 / cells) - 1.0
 
 
 class CameraLift(nn.Module):
@@ -82,7 +67,7 @@ class CameraLift(nn.Module):
         both = torch.cat([both, torch.zeros_like(both[:, :1])], dim=1)
         e = torch.cat([ego_to_image.float(), torch.zeros_like(ego_to_image[:, :1]).float()], dim=1)
         samples = self._choose(e, h, w)
-        read = self._read(both, samples)  # (B, width + heads, S, K)
+        read = read_maps(both, samples.camera, samples.column, samples.row)  # (B, …, S, K)
         value, key = read[:, : -self.heads], read[:, -self.heads :]
         bias = self.geometry(samples.geometry).float().permute(0, 3, 1, 2)
         seen = samples.seen[:, None]
@@ -95,37 +80,16 @@ class CameraLift(nn.Module):
 
     def _choose(self, e: Tensor, h: int, w: int) -> Samples:
         """The two cameras that see each point farthest from their rims."""
-        u, v, depth = project(self.points, e)
-        margin = 1.0 - torch.maximum(
-            ((u + 0.5) * (2.0 / self.width) - 1.0).abs(),
-            ((v + 0.5) * (2.0 / self.height) - 1.0).abs(),
-        )
-        margin = torch.where(depth > MIN_DEPTH, margin, torch.full_like(margin, -1.0))
-        best, camera = margin.topk(VIEWS, dim=1)  # (B, 2, heights · K)
-        column, row, distance = (t.gather(1, camera) for t in (u, v, depth))
-        height = self.points[2].expand_as(distance)
-        near = distance.clamp(0.0, 60.0) / 20.0
-        geometry = torch.stack([best.clamp(min=0.0), near, height], dim=-1)
+        best = best_views(self.points, e, (self.height, self.width), VIEWS)
+        height = self.points[2].expand_as(best.depth)
+        near = best.depth.clamp(0.0, 60.0) / 20.0
+        geometry = torch.stack([best.margin.clamp(min=0.0), near, height], dim=-1)
         cells = self.rows * self.columns
         batch = e.shape[0]
         return Samples(
-            camera.reshape(batch, -1, cells),
-            at(column, self.stride, w).clamp(-1.0, 1.0).reshape(batch, -1, cells),
-            at(row, self.stride, h).clamp(-1.0 + 1.0 / h, 1.0 - 1.0 / h).reshape(batch, -1, cells),
-            (best > 0).float().reshape(batch, -1, cells),
+            best.camera.reshape(batch, -1, cells),
+            at(best.column, self.stride, w).reshape(batch, -1, cells),
+            at(best.row, self.stride, h).reshape(batch, -1, cells),
+            (best.margin > 0).float().reshape(batch, -1, cells),
             geometry.reshape(batch, -1, cells, 3),
-        )
-
-    def _read(self, features: Tensor, samples: Samples) -> Tensor:
-        """(B, N, C, h, w) float32 at S · K places → (B, C, S, K).
-
-        All images of a frame stand one over the other, so that one sampling serves them all; rows
-        stay half a cell from the rims, so that no neighbour in the stack is read.
-        """
-        batch, cameras, channels, h, w = features.shape
-        atlas = features.transpose(1, 2).reshape(batch, channels, cameras * h, w)
-        row = (samples.camera.float() + (samples.row + 1.0) * 0.5) * (2.0 / cameras) - 1.0
-        where = torch.stack([samples.column, row], dim=-1)
-        return F.grid_sample(
-            atlas, where, mode="bilinear", padding_mode="border", align_corners=False
         )
