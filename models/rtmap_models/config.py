@@ -81,11 +81,25 @@ class TinyConfig(ModelConfig):
     point_width: int
     heads: int
     layers: int
+    image_width: int = 0  # channels of the image features; 0 = the picture is all that is read
+    image_heights_m: tuple[float, ...] = ()  # where a 1 m cell looks into the images; () = nowhere
+    tilt_sigma: float = 0.0  # slopes that teach the head for pitch and roll; 0 = no such head
+
+    @property
+    def needs_images(self) -> bool:
+        """The image branch reads images, and the picture is warped as it says."""
+        return self.image_width > 0
 
     def check(self) -> str | None:
         """What is wrong with the values, if anything."""
         if any(size % 16 for size in self.picture_size):
             return "the picture must have multiples of 16 cells: change cell_m"
+        if self.image_width < 0 or self.tilt_sigma < 0:
+            return "image_width and tilt_sigma must not be negative"
+        if (self.image_width > 0) != bool(self.image_heights_m or self.tilt_sigma):
+            return "image_width goes with image_heights_m, tilt_sigma or both"
+        if self.needs_images and any(size % 8 for size in self.image_size):
+            return "image_size must be multiples of 8"
         return super().check()
 
 
@@ -215,7 +229,18 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def load_config(name: str | Path = "rtmap-tiny") -> ModelConfig:
-    """Read a configuration by name (in ``configs/``) or by path."""
+    """Read a configuration by name (in ``configs/``) or by path.
+
+    A key ``base`` names another one there: what the file does not say is as there.
+    """
+    values, path = _read_values(name)
+    values.pop("training", None)  # how to train it, not what it is: rtmap_models.training.recipe
+    if (base := values.pop("base", None)) is not None:
+        values = load_config(CONFIGS / f"{base}.toml").to_dict() | values
+    return config_from_dict(values, path)
+
+
+def _read_values(name: str | Path) -> tuple[dict[str, Any], Path]:
     path = Path(name)
     if path.suffix != ".toml":
         path = CONFIGS / f"{name}.toml"
@@ -223,8 +248,6 @@ def load_config(name: str | Path = "rtmap-tiny") -> ModelConfig:
         have = ", ".join(sorted(p.stem for p in CONFIGS.glob("*.toml")))
         raise BadInput(path, "no such configuration", f"use one of {have} or a .toml file")
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8")), path
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise BadInput(path, f"not TOML: {error}", "mend the file") from error
-    values.pop("training", None)  # how to train it, not what it is: rtmap_models.training.recipe
-    return config_from_dict(values, path)

@@ -64,8 +64,9 @@ class PictureNet(nn.Module):
         position = cell_centres(1.0, 1.0, *config.picture_size).permute(2, 0, 1)[None]
         self.register_buffer("position", position.contiguous(), persistent=False)
 
-    def forward(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns fine (B, fine_width, H/2, W/2) and coarse (B, coarse_width, H/4, W/4)."""
+    def forward(self, picture: Tensor, more: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Returns fine (B, fine_width, H/2, W/2) and coarse (B, coarse_width, H/4, W/4); ``more``,
+        of the coarse map's shape, is added to it before the fine one is made of it."""
         position = self.position.to(picture.dtype).expand(picture.shape[0], -1, -1, -1)
         x = torch.cat([picture, position], dim=1)
         x2 = self.down2(x.contiguous(memory_format=torch.channels_last))
@@ -75,5 +76,7 @@ class PictureNet(nn.Module):
         x16 = F.relu(x16 + self.whole(x16.mean(dim=(2, 3), keepdim=True)))
         y8 = self.mix8(x8 + _double(self.lift8(x16)))
         y4 = self.mix4(x4 + _double(self.lift4(y8)))
+        if more is not None:
+            y4 = y4 + more.to(y4.dtype)
         y2 = self.mix2(self.side2(x2) + _double(self.lift2(y4)))
         return y2, y4

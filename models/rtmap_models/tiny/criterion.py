@@ -14,9 +14,13 @@ from torch.nn import functional as F
 
 from rtmap_models.data.dataset import Batch
 from rtmap_models.tiny.decoder import LayerOutput
+from rtmap_models.tiny.image_branch import Tilts
 from rtmap_models.tiny.matcher import Matcher
 from rtmap_models.tiny.prediction import Prediction
 from rtmap_models.tiny.queries import DenseProposals
+
+TILT_UNIT = 0.01
+"""Slopes of the road that are off by more are punished in proportion, below in squares."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,7 @@ class LossWeights:
     field: float = 1.0
     heat: float = 0.5
     proposal: float = 1.0
+    tilt: float = 1.0
 
 
 def compute_losses(prediction: Prediction, batch: Batch, weights: LossWeights) -> dict[str, Tensor]:
@@ -46,6 +51,8 @@ def compute_losses(prediction: Prediction, batch: Batch, weights: LossWeights) -
     parts["field"] = weights.field * _field(prediction.field, batch)
     heat, shape = _proposals(prediction.proposals, batch)
     parts["heat"], parts["proposal"] = weights.heat * heat, weights.proposal * shape
+    if prediction.tilts is not None and len(prediction.tilts.slopes):
+        parts["tilt"] = weights.tilt * tilt_loss(prediction.tilts)
     return parts
 
 
@@ -89,6 +96,15 @@ def _layer_losses(
 def point_loss(error: Tensor) -> Tensor:
     """Manhattan distance: steep near zero, never flat. ``error`` (M, V, 2) ≥ 0, metres."""
     return _mean(4.0 * torch.log1p(error / 2.0) + 0.5 * error)
+
+
+def tilt_loss(tilts: Tilts) -> Tensor:
+    """Smooth L1 of the slopes in units of `TILT_UNIT`, where the road is known."""
+    known = ~tilts.true.isnan()
+    error = torch.where(known, tilts.slopes - tilts.true, torch.zeros_like(tilts.true))
+    return F.smooth_l1_loss(error / TILT_UNIT, torch.zeros_like(error), reduction="sum") / (
+        known.sum().clamp(min=1)
+    )
 
 
 def _mean(values: Tensor) -> Tensor:

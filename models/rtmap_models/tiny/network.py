@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
+from rtmap_cli.errors import BadInput
 from rtmap_models.answer import Answer, AnsweringNet
 from rtmap_models.bev import BevWarp, normalize_picture
 from rtmap_models.config import TinyConfig
 from rtmap_models.tiny.backbone import PictureNet
 from rtmap_models.tiny.criterion import LossWeights, compute_losses
 from rtmap_models.tiny.decoder import Decoder, attention_bias
+from rtmap_models.tiny.image_branch import ImageBranch
 from rtmap_models.tiny.prediction import Prediction
 from rtmap_models.tiny.queries import (
     FieldHead,
@@ -33,6 +35,7 @@ class RTMapNet(AnsweringNet):
 
     def __init__(self, config: TinyConfig):
         super().__init__(config)
+        self.image_branch = ImageBranch(config) if config.needs_images else None
         self.warp = BevWarp(*config.half_range, *config.picture_size, config.supersample)
         self.picture_net = PictureNet(config)
         self.segment = nn.Conv2d(config.fine_width, len(config.classes), 1)
@@ -49,12 +52,14 @@ class RTMapNet(AnsweringNet):
         prior_class: Tensor,
         prior_mask: Tensor,
         prior_visible: Tensor | None = None,
+        lifted: Tensor | None = None,
     ) -> Prediction:
         """From a normalised picture (B, 4, H, W) and a prior; all layers, for the losses.
 
-        ``prior_visible`` (B,) 0 hides the prior from the new queries (default: visible).
+        ``prior_visible`` (B,) 0 hides the prior from the new queries (default: visible). ``lifted``
+        is what an image branch adds to the coarse map.
         """
-        fine, coarse = self.picture_net(picture)
+        fine, coarse = self.picture_net(picture, lifted)
         new, dense = self.propose(coarse)
         prior = self.encode_prior(prior_points, prior_class, prior_mask)
         if prior_visible is None:
@@ -82,20 +87,33 @@ class RTMapNet(AnsweringNet):
         z = 0; ``prior_points`` (B, P, V, 2) metres; ``prior_class`` int64 (B, P); ``prior_mask``
         (B, P), 1 = used. P must be at least 1 (an unused slot will do).
         """
+        lifted = None
+        if self.image_branch is not None:
+            ego_to_image, lifted = self.image_branch(images, ego_to_image)
         picture = normalize_picture(self.warp(images, ego_to_image))
         prior = (prior_points, prior_class, prior_mask)
-        return self.answer(self.predict(picture, *prior), *prior)
+        return self.answer(self.predict(picture, *prior, lifted=lifted), *prior)
 
     def predict_batch(self, batch: Batch, bf16: bool = False) -> Prediction:
         """All layers on a training batch; convolutions in bfloat16 where that is asked for."""
+        prior = (batch.prior_points, batch.prior_class, batch.prior_mask, batch.prior_visible)
         with torch.autocast(batch.picture.device.type, torch.bfloat16, enabled=bf16):
-            return self.predict(
-                normalize_picture(batch.picture),
-                batch.prior_points,
-                batch.prior_class,
-                batch.prior_mask,
-                batch.prior_visible,
+            if self.image_branch is None:
+                return self.predict(normalize_picture(batch.picture), *prior)
+            if batch.images is None or batch.ego_to_image is None or batch.plane is None:
+                raise BadInput(
+                    "frames", "they hold no camera images", "make them for this --config"
+                )
+            looked, tilts = self.image_branch.train_on(
+                batch.images, batch.ego_to_image, batch.plane
             )
+            picture = self._warped(batch.images, looked.ego_to_image)
+            return self.predict(picture, *prior, looked.coarse)._replace(tilts=tilts)
+
+    @torch.no_grad()
+    def _warped(self, images: Tensor, ego_to_image: Tensor) -> Tensor:
+        """The normalised picture, as from disk: in whole numbers."""
+        return normalize_picture(self.warp(images, ego_to_image).round())
 
     def losses(self, batch: Batch, bf16: bool = False) -> dict[str, Tensor]:
         """The weighted parts of the loss by name; their sum is the loss."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from rtmap_models.tiny.decoder import LayerOutput
+from rtmap_models.tiny.image_branch import Tilts
 from rtmap_models.tiny.queries import DenseProposals
 
 
@@ -18,3 +19,4 @@ class Prediction(NamedTuple):
     segmentation: Tensor  # (B, C, H/2, W/2) logits
     field: Tensor  # (B, C, 2, H/2, W/2) metres to the nearest element of the class
     new_count: int
+    tilts: Tilts | None = None  # in training with a tilt head
