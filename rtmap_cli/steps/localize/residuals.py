@@ -49,12 +49,19 @@ class Noise:
         return Noise(self.weight, np.copysign(size, linear.normal))
 
 
-def linearize(lines: MapLines, seen: Detections, pose: Array, gate_m: float) -> Linear:
-    """Associate every vertex at ``pose`` (T, 3) and differentiate n · (R p + t - q)."""
+def linearize(
+    lines: MapLines, seen: Detections, pose: Array, gate_m: float, shift: Array | None = None
+) -> Linear:
+    """Associate every vertex at ``pose`` (T, 3) and differentiate n · (R p + t - q).
+
+    ``shift`` (E, V, 2), map axes, is added to the vertices when their lines are looked for: what
+    is known of their errors must not lead them to another line. Residuals are without it.
+    """
     c, s = np.cos(pose[seen.frame, 2]), np.sin(pose[seen.frame, 2])
     turn = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)  # p @ turn = R p
     turned = seen.points @ turn
     at = turned + pose[seen.frame, None, :2]
+    at = at if shift is None else at + shift
     shape = seen.points.shape[:2]
     match = lines.match(
         at.reshape(-1, 2),
@@ -68,7 +75,10 @@ def linearize(lines: MapLines, seen: Detections, pose: Array, gate_m: float) -> 
     jacobian[..., :2] = normal
     # d(R p)/dyaw = R p turned left by 90 degrees.
     jacobian[..., 2] = normal[..., 1] * turned[..., 0] - normal[..., 0] * turned[..., 1]
-    r = np.where(match.sample >= 0, match.across, 0.0).reshape(shape)
+    across = match.across.reshape(shape)
+    if shift is not None:
+        across = across - (normal * shift).sum(-1)
+    r = np.where(match.sample.reshape(shape) >= 0, across, 0.0)
     return Linear(r, jacobian, normal @ np.swapaxes(turn, -1, -2), match.sample.reshape(shape))
 
 

@@ -12,7 +12,7 @@ from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
 from rtmap_cli.steps.localize.motion import STATE, Motion, add_motion
 from rtmap_cli.steps.localize.place import PlaceField
-from rtmap_cli.steps.localize.residuals import judge, linearize, noise_of
+from rtmap_cli.steps.localize.residuals import Noise, judge, linearize, noise_of
 from rtmap_cli.steps.localize.single import Solution
 
 Array = NDArray[np.float64]
@@ -38,9 +38,11 @@ def solve_smooth(
 ) -> Solution:
     """Gauss–Newton over all frames; ``start`` are the single-frame answers.
 
-    Errors that several frames share are inflated by the number of frames that see them: an
-    element's own offset over ``element_length_m`` of travel, the map's over ``map_persist_m``.
-    What stays at the place for the whole drive is the field, and is solved for.
+    What stays at the place for the whole drive is the field, and is solved for; lines are looked
+    for where the vertices are without it. Other errors that several frames share are inflated by
+    the number of frames that see them: the map's over ``map_persist_m`` of travel, and an
+    element's own offset over ``element_length_m``, this one in the covariance alone: in the
+    solution it would leave to the field what frames can tell from it.
     """
     pose, bias = _start(motion, start)
     spacing = motion.spacing[seen.frame]
@@ -49,27 +51,41 @@ def solve_smooth(
     once = model.element_share + _FIELD_DOUBT * model.place_share
     chunk = chunks(motion.step, settings.chunk_m)
     field: PlaceField | None = None
+    shift: Array | None = None
     for gate, doubt in zip(settings.smooth_gates_m, settings.smooth_doubts_m, strict=True):
-        linear = linearize(lines, seen, pose, gate)
+        linear = linearize(lines, seen, pose, gate, shift)
         field = PlaceField(lines, seen, linear, chunk, model, field)
         plain = noise_of(lines, seen, linear, model, once).doubted(linear, doubt)
-        rest = linear.r + field.predict()
-        judgement = judge(seen, linear, plain, rest, model, settings.huber)
-        noise = noise_of(lines, seen, linear, model, model.element_share * repeats, map_repeats)
-        weight = judgement.weight(noise)
-        system = BlockSystem(field.sizes)
-        information, chi2 = field.add(system, weight, noise.shared)
-        index = field.frame_index
-        add_motion(system, index, motion, pose, bias)
-        system.factor()
+        judgement = judge(seen, linear, plain, linear.r + field.predict(), model, settings.huber)
+        noise = noise_of(lines, seen, linear, model, model.element_share, map_repeats)
+        weight, index = judgement.weight(noise), field.frame_index
+        system, _, _ = _system(field, weight, noise, motion, pose, bias)
         step = system.solve()
         pose = pose + step[index[:, None] + np.arange(3)]
         bias = bias + step[index[:, None] + np.arange(3, STATE)]
         field.update(step)
+        shift = field.predict()[..., None] * linear.jacobian[..., :2]
+    if field is None:
+        raise ValueError("smooth_gates_m is empty")
+    noise = noise_of(lines, seen, linear, model, model.element_share * repeats, map_repeats)
+    weight = judgement.weight(noise)
+    system, information, chi2 = _system(field, weight, noise, motion, pose, bias)
     used = seen.sum_by_frame(((weight > 0) & (judgement.inlier[:, None] > 0.5)).sum(-1))
     covariance = _pose_blocks(system, chunk, index)
     spread = np.zeros_like(covariance)
     return Solution(pose, covariance, information, chi2, used.astype(np.int64), spread)
+
+
+def _system(
+    field: PlaceField, weight: Array, noise: Noise, motion: Motion, pose: Array, bias: Array
+) -> tuple[BlockSystem, Array, Array]:
+    """The factored system of map residuals, field and motion; information (T, 3, 3) and χ² (T,)
+    of the map residuals alone."""
+    system = BlockSystem(field.sizes)
+    information, chi2 = field.add(system, weight, noise.shared)
+    add_motion(system, field.frame_index, motion, pose, bias)
+    system.factor()
+    return system, information, chi2
 
 
 def chunks(step: Array, length_m: float) -> Index:
