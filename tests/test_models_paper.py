@@ -23,6 +23,7 @@ from rtmap_models.data.samples import PriorNoise, Scene  # noqa: E402
 from rtmap_models.export.example import example_inputs  # noqa: E402
 from rtmap_models.export.onnx_file import export_onnx  # noqa: E402
 from rtmap_models.paper.assign import Assigner, jobs_of, many_jobs  # noqa: E402
+from rtmap_models.paper.attention import SelfAttention  # noqa: E402
 from rtmap_models.paper.criterion import (  # noqa: E402
     focal_loss,
     image_target,
@@ -385,6 +386,27 @@ def test_a_hidden_prior_does_not_reach_the_new_queries(learnt: Any) -> None:
     last = [x.layers[-1].points[:, :n] for x in (empty, hidden, seen)]
     assert torch.allclose(last[0], last[1], atol=1e-3)
     assert not torch.allclose(last[0], last[2], atol=1e-3)
+
+
+def test_attention_in_bfloat16_is_attention() -> None:
+    torch.manual_seed(0)
+    attention = SelfAttention(16, 2, 0.0)
+    x, place, weight = torch.randn(3, 2, 6, 16)
+    bias = torch.zeros(2, 1, 6, 6)
+    bias[..., 5] = -1e4  # the last token is not looked at
+    results = []
+    for bf16 in (False, True):
+        attention.zero_grad()
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            out = attention(x, place, bias)
+        (out * weight).sum().backward()
+        results.append((out.detach(), attention.query_key.weight.grad))
+    for single, half in zip(*results, strict=True):
+        assert torch.allclose(single, half, atol=0.05 * float(single.abs().max()))
+    changed = x.clone()
+    changed[:, 5] += 1.0
+    with torch.autocast("cpu", torch.bfloat16), torch.no_grad():
+        assert torch.equal(attention(x, place, bias)[:, :5], attention(changed, place, bias)[:, :5])
 
 
 def test_learned_pose_ignores_unused_slots() -> None:

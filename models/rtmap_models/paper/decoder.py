@@ -67,10 +67,14 @@ class DecoderLayer(nn.Module):
         self.register_buffer("frequencies", frequencies, persistent=False)
 
     def forward(
-        self, queries: HybridQueries, bev: Tensor, bias: Tensor | None, prior_class: Tensor | None
+        self,
+        queries: HybridQueries,
+        values: Tensor,
+        bias: Tensor | None,
+        prior_class: Tensor | None,
     ) -> LayerTokens:
-        """``bev`` (B, D, h, w) float32, ``bias`` (B, 1, Q, Q), ``prior_class`` one-hot
-        (B, P, C) of the last P queries."""
+        """``values`` of the map (`DeformableAttention.values`), ``bias`` (B, 1, Q, Q),
+        ``prior_class`` one-hot (B, P, C) of the last P queries."""
         x, points = queries.tokens, queries.points
         batch, count, vertices, width = x.shape
         place = queries.place + self.where(self._position(points)).float()
@@ -83,7 +87,7 @@ class DecoderLayer(nn.Module):
         along = x.reshape(batch * count, vertices, width)
         along = self.within(along, place.reshape(batch * count, vertices, width))
         flat = along.reshape(batch, count * vertices, width)
-        flat = self.cross(flat, place.flatten(1, 2), points.flatten(1, 2), bev)
+        flat = self.cross(flat, place.flatten(1, 2), points.flatten(1, 2), values)
         flat = self.norm(flat + self.feed(flat).float())
         x = flat.reshape(batch, count, vertices, width)
         step = self.move(x).float()
@@ -119,13 +123,22 @@ class PaperDecoder(nn.Module):
         super().__init__()
         self.layers = nn.ModuleList(DecoderLayer(config) for _ in range(config.layers))
 
+    def values(self, bev: Tensor) -> list[Tensor]:
+        """What each layer reads on the map (B, D, h, w): made once for all queries."""
+        return [layer.cross.values(bev) for layer in self.layers]
+
     def forward(
-        self, queries: HybridQueries, bev: Tensor, bias: Tensor | None, prior_class: Tensor | None
+        self,
+        queries: HybridQueries,
+        values: list[Tensor],
+        bias: Tensor | None,
+        prior_class: Tensor | None,
     ) -> list[LayerTokens]:
-        """Hybrid queries and the map → every layer's output, the last one being the answer."""
+        """Hybrid queries and what `values` made of the map → every layer's output, the last one
+        being the answer."""
         outputs: list[LayerTokens] = []
-        for layer in self.layers:
-            made = layer(queries, bev, bias, prior_class)
+        for layer, of_layer in zip(self.layers, values, strict=True):
+            made = layer(queries, of_layer, bias, prior_class)
             outputs.append(made)
             queries = HybridQueries(made.tokens, queries.place, made.output.points.detach())
         return outputs

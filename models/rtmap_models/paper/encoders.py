@@ -87,7 +87,7 @@ class CameraEncoder(nn.Module):
         if self.training:
             flat = self.classify(features.flatten(0, 1)).float()
             shown = flat.reshape(*features.shape[:2], *flat.shape[1:])
-        return Encoded(self.bev(self.lift(features, ego_to_image)).float(), shown)
+        return Encoded(self.bev(self.lift(features, ego_to_image)), shown)
 
 
 class RasterEncoder(nn.Module):
@@ -115,4 +115,4 @@ class RasterEncoder(nn.Module):
     def forward(self, raster: Tensor) -> Encoded:
         """``raster`` float (B, raster_channels, 2 · rows, 2 · columns): rows go with +y, columns
         with +x, cells of ``cell_m``, values about 0 … 1."""
-        return Encoded(self.bev(self.stem(raster) + self.row + self.column).float(), None)
+        return Encoded(self.bev(self.stem(raster) + self.row + self.column), None)

@@ -59,16 +59,16 @@ class CameraLift(nn.Module):
         Returns (B, width, rows, columns); absent cameras (all zeros) change nothing. Projection
         and sampling are float32 throughout: coordinates do not survive bfloat16.
         """
-        batch, cameras, _, h, w = features.shape
-        flat = features.flatten(0, 1)
-        both = torch.cat([self.value(flat), self.key(flat)], dim=1).float()
-        both = both.reshape(batch, cameras, -1, h, w)
-        # A last camera that sees nothing: there are always two to choose from.
-        both = torch.cat([both, torch.zeros_like(both[:, :1])], dim=1)
+        batch, _, _, h, w = features.shape
         e = torch.cat([ego_to_image.float(), torch.zeros_like(ego_to_image[:, :1]).float()], dim=1)
         samples = self._choose(e, h, w)
-        read = read_maps(both, samples.camera, samples.column, samples.row)  # (B, …, S, K)
-        value, key = read[:, : -self.heads], read[:, -self.heads :]
+        where = samples.camera, samples.column, samples.row
+        flat = features.flatten(0, 1)
+        # Read apart, so that training need not copy what was read, by far its largest tensor.
+        value, key = (
+            read_maps(_with_blind_camera(made(flat), batch), *where)  # (B, …, S, K)
+            for made in (self.value, self.key)
+        )
         bias = self.geometry(samples.geometry).float().permute(0, 3, 1, 2)
         seen = samples.seen[:, None]
         weight = (key + bias + (seen - 1.0) * -BLOCKED).softmax(dim=2) * seen
@@ -76,7 +76,7 @@ class CameraLift(nn.Module):
         mixed = (value * weight[:, :, None]).sum(dim=3).flatten(1, 2)  # (B, width, K)
         bev = self.out(mixed.transpose(1, 2)).transpose(1, 2)
         bev = bev.reshape(batch, -1, self.rows, self.columns)
-        return bev + self.row + self.column
+        return bev + (self.row + self.column)
 
     def _choose(self, e: Tensor, h: int, w: int) -> Samples:
         """The two cameras that see each point farthest from their rims."""
@@ -93,3 +93,10 @@ class CameraLift(nn.Module):
             (best.margin > 0).float().reshape(batch, -1, cells),
             geometry.reshape(batch, -1, cells, 3),
         )
+
+
+def _with_blind_camera(maps: Tensor, batch: int) -> Tensor:
+    """(B · N, C, h, w) → (B, N + 1, C, h, w) float32: the last camera sees nothing, so that there
+    are always two to choose from."""
+    maps = maps.float().reshape(batch, -1, *maps.shape[1:])
+    return torch.cat([maps, torch.zeros_like(maps[:, :1])], dim=1)

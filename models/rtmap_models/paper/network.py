@@ -52,13 +52,14 @@ class PaperNet(AnsweringNet):
         bias = attention_bias(config.new_queries, prior_mask, prior_visible)
         classes = len(config.classes)
         own = F.one_hot(prior_class.clamp(0, classes - 1), classes).float()
-        made: list[LayerTokens] = self.decoder(queries, bev, bias, own)
+        values = self.decoder.values(bev)
+        made: list[LayerTokens] = self.decoder(queries, values, bias, own)
         n = config.new_queries
         slots = queries.tokens[:, n:]
         poses = [self.learned_pose(slots, m.tokens[:, n:], prior_mask) for m in made]
         many: list[LayerTokens] = []
         if self.training and config.many_queries and config.many_weight:
-            many = self.decoder(self.encode_queries.many(len(bev)), bev, None, None)
+            many = self.decoder(self.encode_queries.many(len(bev)), values, None, None)
         return PaperPrediction(
             [m.output for m in made],
             n,
