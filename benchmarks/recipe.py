@@ -2,11 +2,12 @@
 
     rtmap train -o w.pt --frames 4000 --data frames --seed 0
     rtmap train -o w.pt --frames 240 --data held-out --seed 90
-    python benchmarks/recipe.py --data frames --held-out held-out --steps 600
+    python benchmarks/recipe.py --data frames --held-out held-out --steps 250
 
 Every variant starts fresh (or from ``--init``), sees the same frames in the same order and is
 judged after the learning rate has fallen to zero, by the same held-out frames. Prints a table in
-Markdown. Takes (variants + 1) · steps / (steps per second).
+Markdown. So few steps show what makes learning faster, not what a long run ends with. Takes
+variants · steps / (steps per second).
 """
 
 from __future__ import annotations
@@ -27,13 +28,10 @@ VARIANTS: dict[str, list[str]] = {
     "learning rate doubled": ["rate=2.4e-3"],
     "no averaged weights": ["average=0.0"],
     "prior never hidden": ["augmentation.hidden=0.0"],
-    "prior always hidden": ["augmentation.hidden=1.0"],
-    "no mirroring": ["augmentation.mirror=false"],
-    "nothing turned or shifted": ["augmentation.still=1.0"],
-    "colours as they are": [
-        "augmentation.contrast=0.0", "augmentation.brightness=0.0", "augmentation.tint=0.0"
+    "nothing varied": [
+        "augmentation.still=1.0", "augmentation.mirror=false",
+        "augmentation.contrast=0.0", "augmentation.brightness=0.0", "augmentation.tint=0.0",
     ],
-    "float32": ['precision="fp32"'],
 }  # fmt: skip
 
 
@@ -65,7 +63,7 @@ def main() -> None:
     parser.add_argument("--held-out", type=Path, required=True)
     parser.add_argument("--config", default="rtmap-tiny")
     parser.add_argument("--init", help="weights or model to start from")
-    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--steps", type=int, default=250)
     parser.add_argument("--frames", type=int, default=120, help="held-out frames to look at")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
