@@ -48,6 +48,19 @@ def test_the_path_says_it_without_heights() -> None:
         assert plane == pytest.approx([SLOPES[0], 0.0, 0.0], abs=5e-4)
 
 
+def test_a_body_that_rises_leaves_the_road_where_it_was() -> None:
+    """On a bend all of the path lies to one side: a rise must not turn into a slope."""
+    angle = np.linspace(-1.0, 1.0, 41)
+    poses = [level_pose(30 * np.sin(a), 30 - 30 * np.cos(a), a) for a in angle]
+    for pose in poses:
+        pose[2, 3] = 5.0
+    poses[20][2, 3] += 0.04
+    for prior, slopes in ((None, (0.0, 0.0)), (sloped_map(), SLOPES)):
+        plane = RoadUnder(poses, prior).plane(poses[20])
+        assert plane[:2] == pytest.approx(slopes, abs=3e-3)
+    assert RoadUnder(poses).plane(poses[20])[2] == pytest.approx(-0.04, abs=6e-3)
+
+
 def test_nothing_known_is_level_and_broken_heights_are_no_road() -> None:
     alone = level_pose(0.0, 0.0)
     assert (RoadUnder([alone] * 5).plane(alone) == 0).all()

@@ -36,6 +36,9 @@ SLOPE_SIGMA = 0.03
 """How much slopes vary that nothing measures (across a path, say): the weight of ground that is
 level in the map frame (roads lean less against that than vehicles against their roads)."""
 
+HEAVE_SIGMA_M = 0.03
+"""How far a body rises and sinks on its springs, metres."""
+
 STEEPEST = 0.2
 """Slopes beyond this are errors of poses, not roads; the frame is left as it is."""
 
@@ -55,38 +58,38 @@ class RoadUnder:
     def plane(self, map_SE3_ego: Array) -> Array:
         """(3,) a, b, c of the road z = a x + b y + c in the ego frame dropped to the road, metres.
 
-        c is 0: where the vehicle stands its wheels touch the road. Zero where nothing is known.
+        c is how far the path around lies above this pose: the body rises and sinks, the road does
+        not. Zero where nothing is known.
         """
         here, back = map_SE3_ego[:2, 3], invert(map_SE3_ego)
-        for tree, places in ((self.known_tree, self.known), (self.path_tree, self.path)):
-            if tree is None:
-                continue
-            near = places[tree.query_ball_point(here, REACH_M)]
-            if tree is self.known_tree and len(near) < MIN_POINTS:
-                continue
-            local = near @ back[:3, :3].T + back[:3, 3]
-            up = map_SE3_ego[2, :3]
-            level = -up[:2] / max(up[2], 0.5)
-            slopes = _slopes(local, level, through_origin=tree is self.path_tree)
-            if np.abs(slopes).max() < STEEPEST:
-                return np.array([*slopes, 0.0])
-        return np.zeros(3)
+        up = map_SE3_ego[2, :3]
+        level = -up[:2] / max(up[2], 0.5)
+        path = self.path[self.path_tree.query_ball_point(here, REACH_M)]
+        path = path @ back[:3, :3].T + back[:3, 3]
+        if self.known_tree is not None:
+            near = self.known[self.known_tree.query_ball_point(here, REACH_M)]
+            if len(near) >= MIN_POINTS:
+                # The map's heights and the pose's may have different zeros.
+                slopes = _fit(near @ back[:3, :3].T + back[:3, 3], level, np.inf)[:2]
+                if np.abs(slopes).max() < STEEPEST:
+                    fixed = _fit(path, slopes, HEAVE_SIGMA_M, slope=1e-6)
+                    return np.append(slopes, fixed[2])
+        plane = _fit(path, level, HEAVE_SIGMA_M)
+        return plane if np.abs(plane[:2]).max() < STEEPEST else np.zeros(3)
 
 
-def _slopes(local: Array, level: Array, through_origin: bool) -> Array:
-    """(2,) a, b by least squares with ``level`` (2,) ground as the prior; (n, 3) ego metres.
-
-    The map's heights and the pose's may have different zeros: unless ``through_origin`` a common
-    shift is solved for and forgotten.
-    """
-    rows = np.column_stack([local[:, :2], np.full(len(local), 0.0 if through_origin else 1.0)])
+def _fit(local: Array, level: Array, heave: float, slope: float = SLOPE_SIGMA) -> Array:
+    """(3,) a, b, c by least squares through (n, 3) ego metres; as the prior, slopes are ``level``
+    (2,) with a standard deviation ``slope`` and c is 0 with ``heave``."""
+    rows = np.column_stack([local[:, :2], np.ones(len(local))])
     distance = np.hypot(local[:, 0], local[:, 1])
     weight = 1.0 / (1.0 + (distance / HALF_M) ** 2) / PLACE_SIGMA_M
-    ridge = np.diag([SLOPE_SIGMA**-2.0, SLOPE_SIGMA**-2.0, 1e-6])
+    prior = np.array([slope**-2.0, slope**-2.0, max(heave**-2.0, 1e-6)])
     rows, z = rows * weight[:, None], local[:, 2] * weight
-    right = rows.T @ z + ridge @ np.append(level, 0.0)
-    solved: Array = np.linalg.solve(rows.T @ rows + ridge, right)
-    return solved[:2]
+    solved: Array = np.linalg.solve(
+        rows.T @ rows + np.diag(prior), rows.T @ z + prior * np.append(level, 0.0)
+    )
+    return solved
 
 
 def _thinned(path: Array, step: float = 1.0) -> Array:
