@@ -58,7 +58,7 @@ def test_a_body_that_rises_leaves_the_road_where_it_was() -> None:
     for prior, slopes in ((None, (0.0, 0.0)), (sloped_map(), SLOPES)):
         plane = RoadUnder(poses, prior).plane(poses[20])
         assert plane[:2] == pytest.approx(slopes, abs=3e-3)
-    assert RoadUnder(poses).plane(poses[20])[2] == pytest.approx(-0.04, abs=1e-2)
+    assert -0.04 < RoadUnder(poses).plane(poses[20])[2] < -0.02
 
 
 def test_nothing_known_is_level_and_broken_heights_are_no_road() -> None:
