@@ -20,7 +20,7 @@ from rtmap_cli.errors import RtmapError
 CHANGES = ("delete:ped_crossing", "insert:ped_crossing", "delete:divider", "insert:divider")
 PRIOR_SIGMA = 0.25
 IMAGE_WIDTH = 256
-GONE, NEW = (215, 35, 35), (25, 150, 60)
+GONE, NEW, DRIVEN = (215, 35, 35), (25, 150, 60), (205, 192, 226)
 
 
 @dataclass
@@ -188,7 +188,7 @@ def draw(demo: Demo, cycles: int) -> None:
     from rtmap_cli.maps.crop import MapIndex
     from rtmap_cli.maps.element import VectorMap
     from rtmap_cli.maps.store import read_map
-    from rtmap_cli.steps.picture import Mark, Panel, draw_panels
+    from rtmap_cli.steps.picture import Entry, Mark, Panel, draw_panels
 
     f = demo.folder
     paths = []
@@ -208,18 +208,20 @@ def draw(demo: Demo, cycles: int) -> None:
     town = read_map(f / "town")
     truth = read_changes_marks(f / "changes-truth.json", town.crs)
     told = read_changes_marks(f / "changes.geojson", town.crs)
-    driven = [Mark(path, (170, 205, 235), 8) for path in paths]
+    driven = [Mark(path, DRIVEN, 8) for path in paths]
     panels = [
         Panel("outdated map, true changes", around(read_geojson(f / "prior.geojson", town.crs)),
               truth, driven),
         Panel("the town", around(town), [], driven),
-        Panel(f"map after {cycles} drives, reported changes", around(read_map(f / "map")),
+        Panel(f"map after {cycles} drives, reported changes, probability",
+              around(read_map(f / "map")),
               told, driven),
     ]  # fmt: skip
     legend = [
-        ("boundary", (70, 70, 78)), ("divider", (214, 120, 0)), ("crossing", (30, 110, 190)),
-        ("gone", GONE), ("new", NEW), ("driven", (170, 205, 235)),
-    ]  # fmt: skip
+        Entry("on the old map, gone from the town", GONE),
+        Entry("in the town, not on the old map", NEW),
+        Entry("driven", DRIVEN, 8),
+    ]
     draw_panels(panels, bounds, legend=legend).save(f / "demo.png")
 
 
@@ -239,5 +241,6 @@ def read_changes_marks(path: Path, crs: str) -> list[Any]:
         shape = item["geometry"]
         line = shape["coordinates"][0] if shape["type"] == "Polygon" else shape["coordinates"]
         xy = lonlat_to(crs, np.asarray(line, dtype=np.float64)[:, :2])
-        marks.append(Mark(xy, GONE if item["kind"] == "delete" else NEW, 5))
+        told = f"{item['probability']:.2f}" if "probability" in item else ""
+        marks.append(Mark(xy, GONE if item["kind"] == "delete" else NEW, 5, told))
     return marks

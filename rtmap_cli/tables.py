@@ -19,7 +19,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rtmap_cli.errors import BadInput
+from rtmap_cli.errors import BadInput, UsageError
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,7 @@ def whole_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     import shutil
 
     path = Path(path)
-    if path.exists() and not overwrite and (not path.is_dir() or any(path.iterdir())):
-        raise BadInput(path, "exists already", "choose another output or pass --overwrite")
+    refuse_existing(path, overwrite)
     here = Path.cwd().resolve()
     if path.resolve() in (here, *here.parents, Path.home().resolve()):
         raise BadInput(path, "is where you are, or above it", "choose another output")
@@ -110,6 +109,14 @@ def _check_same_kind(old: Path, new: Path) -> None:
     kind = [name for name in MARKERS if (new / name).exists()]
     if not old.is_dir() or not all((old / name).exists() for name in kind):
         raise BadInput(old, "is something else than what would replace it", "choose another output")
+
+
+def refuse_existing(
+    path: Path, overwrite: bool, todo: str = "choose another output or pass --overwrite"
+) -> None:
+    """UsageError when an output exists and may not be replaced; an empty folder is free."""
+    if path.exists() and not overwrite and (not path.is_dir() or any(path.iterdir())):
+        raise UsageError(f"{path}: exists already; {todo}")
 
 
 def refuse_inside(output: Path, *inputs: Path | None) -> None:

@@ -395,7 +395,7 @@ def test_import_command(rtmap: Callable[..., Any], small_log: Path, tmp_path: Pa
         stored.by_id()["crossing-7"].points,
         read_av2_map(small_log).by_id()["crossing-7"].points,
     )
-    assert "exists already" in rtmap("import", "av2", small_log, "-o", out, code=3).err
+    assert "exists already" in rtmap("import", "av2", small_log, "-o", out, code=2).err
     rtmap("import", "av2", small_log, "-o", out, "--overwrite")
 
 

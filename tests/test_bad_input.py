@@ -141,7 +141,7 @@ def test_what_runs_say_alone_is_replaced_only_when_told(rtmap: Call, town: Path,
     rtmap(*command, "--write-runs")
     (run / "changes.parquet").write_bytes(b"precious")
     (town.parent / "c.geojson").unlink()
-    told = _one_line(rtmap(*command, "--write-runs", code=3))
+    told = _one_line(rtmap(*command, "--write-runs", code=2))
     assert "changes.parquet" in told and "--overwrite" in told
     assert (run / "changes.parquet").read_bytes() == b"precious"
     assert not (town.parent / "c.geojson").exists()

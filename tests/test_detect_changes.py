@@ -156,7 +156,7 @@ def test_it_does_not_overwrite(rtmap: Call, tmp_path: Path) -> None:
     out = tmp_path / "c.geojson"
     out.write_text("mine")
     base = ("detect-changes", run, "--map", tmp_path / "map", "-o", out)
-    assert "--overwrite" in rtmap(*base, code=3).err
+    assert "--overwrite" in rtmap(*base, code=2).err
     assert out.read_text() == "mine"
     rtmap(*base, "--overwrite")
 

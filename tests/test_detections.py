@@ -96,7 +96,7 @@ def test_a_standing_vehicle_is_not_infinitely_well_known() -> None:
 def test_import_refuses_to_overwrite(rtmap: Any, tmp_path: Path) -> None:
     source = write(tmp_path / "drive.json.gz", drive())
     rtmap("import", "detections", source, "-o", tmp_path / "run")
-    assert "exists" in rtmap("import", "detections", source, "-o", tmp_path / "run", code=3).err
+    assert "exists" in rtmap("import", "detections", source, "-o", tmp_path / "run", code=2).err
     rtmap("import", "detections", source, "-o", tmp_path / "run", "--overwrite")
 
 

@@ -203,7 +203,7 @@ def test_an_existing_output_is_kept_unless_told(
     out = tmp_path / "run"
     rtmap("infer", log, "-o", out, "-q", "--frames", 1)
     before = (out / "observations.parquet").read_bytes()
-    assert "--overwrite" in rtmap("infer", log, "-o", out, "-q", code=3).err
+    assert "--overwrite" in rtmap("infer", log, "-o", out, "-q", code=2).err
     assert (out / "observations.parquet").read_bytes() == before
     rtmap("infer", log, "-o", out, "-q", "--frames", 2, "--overwrite")
     assert len(read_run(out).frames) == 2

@@ -75,7 +75,7 @@ def test_import_of_bad_files(tmp_path: Path, rtmap: Call) -> None:
 
 def test_import_does_not_overwrite(folder: Path, tmp_path: Path, rtmap: Call) -> None:
     write_geojson(small_map(), tmp_path / "in.geojson")
-    result = rtmap("import", "geojson", tmp_path / "in.geojson", "-o", folder, code=3)
+    result = rtmap("import", "geojson", tmp_path / "in.geojson", "-o", folder, code=2)
     assert "exists already" in result.err
     rtmap("import", "geojson", tmp_path / "in.geojson", "-o", folder, "--overwrite")
 
@@ -93,7 +93,7 @@ def test_export_of_a_part(folder: Path, tmp_path: Path, rtmap: Call) -> None:
     assert ids(*box) == ["div-a", "ped-a"]
     target = tmp_path / "out.geojson"
     rtmap("export", "geojson", folder, "-o", target)
-    assert "exists already" in rtmap("export", "geojson", folder, "-o", target, code=3).err
+    assert "exists already" in rtmap("export", "geojson", folder, "-o", target, code=2).err
     rtmap("export", "geojson", folder, "-o", target, "--overwrite")
     rtmap("export", "geojson", folder, "-o", "-", "--json", code=2)
     rtmap("export", "geojson", folder, "-o", "-", "--lonlat", code=2)
@@ -146,7 +146,7 @@ def test_diff(cycled: Path, tmp_path: Path, rtmap: Call) -> None:
     kinds = {f["properties"]["id"]: f["properties"]["kind"] for f in out["features"]}
     assert kinds["div-b"] == "removed" and out["features"][-1]["geometry"]["type"] == "Polygon"
     rtmap("map", "diff", cycled, 0, 1, "-o", tmp_path / "d.geojson")
-    rtmap("map", "diff", cycled, 0, 1, "-o", tmp_path / "d.geojson", code=3)
+    rtmap("map", "diff", cycled, 0, 1, "-o", tmp_path / "d.geojson", code=2)
     assert "no version 9" in rtmap("map", "diff", cycled, 0, 9, code=3).err
 
 

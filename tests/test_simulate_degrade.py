@@ -44,5 +44,5 @@ def test_degrade_writes_a_map_that_says_how_wrong_it_is(
     np.testing.assert_allclose(a.covariance[:, [0, 2]], 0.09)
     assert 0.1 < np.abs(a.points[:, 1] - ORIGIN[1]).std() < 0.6
     assert a.attributes == {"mark": "SOLID_WHITE"} and a.points[:, 2].min() >= 3.0 - 1e-9
-    again = rtmap("simulate", "degrade", "--map", tmp_path / "map", "-o", tmp_path / "a", code=3)
+    again = rtmap("simulate", "degrade", "--map", tmp_path / "map", "-o", tmp_path / "a", code=2)
     assert "--overwrite" in again.err

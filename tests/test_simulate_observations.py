@@ -148,7 +148,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(rtmap, tmp_path, world):
     rtmap(*base, "--log", log, "--rate", 1, "--spacing", 2, code=2)
     assert not out.exists() and not list(tmp_path.glob("out/*"))
     rtmap(*base, "--log", log)
-    assert "exists already" in rtmap(*base, "--log", log, code=3).err
+    assert "exists already" in rtmap(*base, "--log", log, code=2).err
     rtmap(*base, "--log", log, "--overwrite")
 
 

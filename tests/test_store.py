@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from map_samples import CRS, EAST, NORTH, assert_same, crossing, line, maps, small_map, tile_files
 
-from rtmap_cli.errors import BadInput
+from rtmap_cli.errors import BadInput, UsageError
 from rtmap_cli.maps import store
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import (
@@ -281,7 +281,7 @@ def test_a_moved_map_is_the_same_map(folder: Path) -> None:
 
 
 def test_overwrite_is_never_implied(folder: Path) -> None:
-    with pytest.raises(BadInput, match="exists already"):
+    with pytest.raises(UsageError, match="exists already"):
         write_new_map(VectorMap([], CRS), folder, "again")
     assert_same(small_map(), read_map(folder))
     write_new_map(VectorMap([line("only")], CRS), folder, "again", overwrite=True)

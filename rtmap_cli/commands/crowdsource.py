@@ -50,6 +50,7 @@ def command(
       rtmap crowdsource runs --map map --message "week 12"
     """
     from rtmap_cli.errors import NoAnswer
+    from rtmap_cli.logs.agreement import warning
     from rtmap_cli.maps.store import commit_map, fused_runs, map_exists, read_map, write_new_map
     from rtmap_cli.output import emit, log
 
@@ -74,6 +75,8 @@ def command(
         emit(result | {"counts": {}}, as_json, [f"{map_path}: all runs are in the map already"])
         return
     _tell_unlocalized([t.run_id for t in fresh if not t.localized], exists)
+    if before is not None and (doubt := warning(fresh, before, map_path)):
+        log(doubt)
     settings = _settings(without_sigma)
     if before is not None and not force and _rebuildable(map_path, known, traversals):
         fusion = _rebuilt(traversals, before, crs, paths, settings)

@@ -67,13 +67,12 @@ def command(
     from rtmap_cli.demo import run_demo
     from rtmap_cli.errors import BadInput
     from rtmap_cli.output import emit, log
-    from rtmap_cli.tables import write_json
+    from rtmap_cli.tables import refuse_existing, write_json
 
     # The folder is written in place: the runs in it name the files that they came from.
     marker = output / "demo.json"
+    refuse_existing(output, overwrite)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        if not overwrite:
-            raise BadInput(output, "exists already", "choose another output or pass --overwrite")
         if not marker.exists():
             raise BadInput(output, "was not written by rtmap demo", "choose another output")
         shutil.rmtree(output)

@@ -55,26 +55,25 @@ def command(
     Example:
       rtmap detect-changes runs/monday runs/tuesday --map map -o changes.geojson
     """
-    from rtmap_cli.errors import BadInput, Findings, NoAnswer, UsageError
+    from rtmap_cli.errors import Findings, NoAnswer, UsageError
     from rtmap_cli.formats.changes import write_change_table, write_changes
+    from rtmap_cli.logs.agreement import warning
     from rtmap_cli.logs.traversal import classes_of, read_traversals
     from rtmap_cli.maps.store import read_map
     from rtmap_cli.output import emit, log
     from rtmap_cli.steps.detect_changes.events import change_events
     from rtmap_cli.steps.detect_changes.evidence import gather_evidence
-    from rtmap_cli.tables import refuse_inside
+    from rtmap_cli.tables import refuse_existing, refuse_inside
 
     stream = str(output) == "-"
     if stream and as_json:
         raise UsageError("--json and -o - both want stdout: choose one")
-    if not stream and output.exists() and not overwrite:
-        raise BadInput(output, "exists already", "choose another output or pass --overwrite")
     if not stream:
         refuse_inside(output, map_path)
+        refuse_existing(output, overwrite)
     tables = [path / "changes.parquet" for path in runs] if write_runs else []
     for table in tables:
-        if table.exists() and not overwrite:
-            raise BadInput(table, "exists already", "pass --overwrite or leave out --write-runs")
+        refuse_existing(table, overwrite, "pass --overwrite or leave out --write-runs")
     prior = read_map(map_path, map_version)
     traversals, _ = read_traversals(runs, prior.crs)
     classes = classes_of(runs)
@@ -82,6 +81,8 @@ def command(
     evidence = gather_evidence(traversals, prior, classes)
     if len(prior) and not any(e.in_view for e in evidence if not e.new):
         raise NoAnswer(f"{map_path}: none of its elements is in view of any frame of these runs")
+    if doubt := warning(traversals, prior, map_path):
+        log(doubt)
     found = change_events(evidence, min_probability, displaced)
     info = {
         "map": str(map_path),
@@ -132,8 +133,8 @@ def _lines(found: list[ChangeEvent]) -> list[str]:
                 c.class_name,
                 c.element_id or "-",
                 f"{c.probability:.3f}",
-                f"{n.traversals_seen}/{n.traversals_in_view}",
-                f"{n.frames_seen}/{n.frames_in_view}",
+                f"{n.traversals_seen} of {n.traversals_in_view} runs",
+                f"{n.frames_seen} of {n.frames_in_view} frames",
             ]
         )
-    return table(["change", "class", "element", "probability", "runs seen", "frames seen"], rows)
+    return table(["change", "class", "element", "probability", "found by", "seen in"], rows)

@@ -36,19 +36,18 @@ def command(
     Example:
       rtmap export geojson map --class divider -o dividers.geojson
     """
-    from rtmap_cli.errors import BadInput, UsageError
+    from rtmap_cli.errors import UsageError
     from rtmap_cli.formats.geojson import write_geojson
     from rtmap_cli.maps.select import select
     from rtmap_cli.output import emit
-    from rtmap_cli.tables import refuse_inside
+    from rtmap_cli.tables import refuse_existing, refuse_inside
 
     stream = str(output) == "-"
     if stream and as_json:
         raise UsageError("--json and -o - both want stdout: choose one")
-    if not stream and output.exists() and not overwrite:
-        raise BadInput(output, "exists already", "choose another output or pass --overwrite")
     if not stream:
         refuse_inside(output, map_path)
+        refuse_existing(output, overwrite)
     vector_map = select(map_path, map_version, bbox, lonlat, class_names)
     write_geojson(vector_map, output)
     if stream:

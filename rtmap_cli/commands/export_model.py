@@ -58,9 +58,11 @@ def command(
     Example:
       rtmap export-model weights.pt -o model.onnx
     """
+    from rtmap_cli.tables import refuse_existing, whole_file
+
     for path in (output, report):
-        if path is not None and path.exists() and not overwrite:
-            raise UsageError(f"{path} exists; pass --overwrite")
+        if path is not None:
+            refuse_existing(path, overwrite)
     if report is not None and report.resolve() == output.resolve():
         raise UsageError("--report and --output are the same file")
     try:
@@ -71,7 +73,6 @@ def command(
     import json
 
     from rtmap_cli.output import emit, plain
-    from rtmap_cli.tables import whole_file
 
     network, content = load_network(weights)
     factors = _calibrated(network, calibrate)

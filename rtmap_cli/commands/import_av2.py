@@ -31,7 +31,9 @@ def command(log_dir: Path, output: Path, city: str | None, overwrite: bool, as_j
     from rtmap_cli.maps.element import CLASSES
     from rtmap_cli.maps.store import write_new_map
     from rtmap_cli.output import emit, log
+    from rtmap_cli.tables import refuse_existing
 
+    refuse_existing(output, overwrite)
     archive = read_av2_archive(log_dir, city)
     vector_map = vector_map_of(archive)
     if not len(vector_map):

@@ -33,8 +33,9 @@ def command(file: Path, output: Path, sigma: float | None, overwrite: bool, as_j
     from rtmap_cli.formats.detections import read_detections
     from rtmap_cli.logs.run import write_run
     from rtmap_cli.output import emit
-    from rtmap_cli.tables import whole_folder
+    from rtmap_cli.tables import refuse_existing, whole_folder
 
+    refuse_existing(output, overwrite)
     run = read_detections(file, sigma)
     with whole_folder(output, overwrite) as folder:
         write_run(run, folder)

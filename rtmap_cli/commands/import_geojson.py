@@ -30,7 +30,9 @@ def command(file: Path, crs: str | None, output: Path, overwrite: bool, as_json:
     from rtmap_cli.maps.element import CLASSES
     from rtmap_cli.maps.store import write_new_map
     from rtmap_cli.output import emit, log
+    from rtmap_cli.tables import refuse_existing
 
+    refuse_existing(output, overwrite)
     vector_map = read_geojson(file, crs)
     if crs is None:
         log(f"{file}: no --crs given, the map is in {vector_map.crs}")

@@ -34,9 +34,10 @@ def command(
     from rtmap_cli.maps.element import CLASSES
     from rtmap_cli.maps.store import write_new_map
     from rtmap_cli.output import emit, log
-    from rtmap_cli.tables import refuse_over
+    from rtmap_cli.tables import refuse_existing, refuse_over
 
     refuse_over(output, folder)
+    refuse_existing(output, overwrite)
     source = read_expansion(folder, location)
     check_map_crs(source.crs, source.path)
     vector_map = vector_map_of(source)

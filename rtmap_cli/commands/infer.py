@@ -84,14 +84,17 @@ def command(
     import os
     import time
 
+    from rtmap_cli.logs.agreement import warning
     from rtmap_cli.logs.open import notes_of, open_log
     from rtmap_cli.logs.run import STATES, write_run
+    from rtmap_cli.logs.traversal import traversal_of
     from rtmap_cli.maps.crs import check_same_crs
     from rtmap_cli.maps.store import read_map
     from rtmap_cli.steps.infer import InferOptions, MapModel, infer_log
     from rtmap_cli.steps.infer.checks import check_prior_in_range
-    from rtmap_cli.tables import whole_folder
+    from rtmap_cli.tables import refuse_existing, whole_folder
 
+    refuse_existing(output, overwrite)
     source = open_log(log_path)
     for note in notes_of(source):
         log(f"{source.log_id}: {note}")
@@ -123,6 +126,8 @@ def command(
             made_by={"log": log_path, "map": str(map_path) if map_path else None},
         )
         write_run(run, folder)
+    if prior is not None and (doubt := warning([traversal_of(run)], prior, str(map_path))):
+        log(doubt)
     seconds = time.perf_counter() - started
     counts = {name: int((run.observations.state == k).sum()) for k, name in enumerate(STATES)}
     result = {

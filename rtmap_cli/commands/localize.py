@@ -10,7 +10,8 @@ import click
 from rtmap_cli import options
 
 if TYPE_CHECKING:
-    from rtmap_cli.logs.run import Poses
+    from rtmap_cli.logs.run import Poses, Run
+    from rtmap_cli.maps.element import VectorMap
 
 
 @click.command("localize")
@@ -56,6 +57,8 @@ def command(
     write_poses(poses, run, loaded.crs)
     if replaced:
         log(f"{run / 'poses.parquet'}: replaced")
+    if doubt := _doubt(loaded, poses, vector_map, map_path):
+        log(doubt)
     result = _summary(poses) | {
         "run": str(run),
         "log_id": loaded.log_id,
@@ -63,6 +66,20 @@ def command(
         "replaced": replaced,
     }
     emit(result, as_json, _lines(result))
+
+
+def _doubt(run: Run, poses: Poses, vector_map: VectorMap, where: Path) -> str | None:
+    """A warning when the map does not look like that of this place; frames without an answer are
+    judged at their initial poses."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from rtmap_cli.logs.agreement import warning
+    from rtmap_cli.logs.traversal import traversal_of
+
+    every = replace(poses, status=np.full(len(poses), "ok", object))
+    return warning([traversal_of(replace(run, poses=every))], vector_map, where)
 
 
 def _summary(poses: Poses) -> dict[str, Any]:

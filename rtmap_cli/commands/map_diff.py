@@ -49,20 +49,19 @@ def command(
     Example:
       rtmap map diff map 0 1
     """
-    from rtmap_cli.errors import BadInput, UsageError
+    from rtmap_cli.errors import UsageError
     from rtmap_cli.maps.crs import check_same_crs
     from rtmap_cli.maps.difference import compare_maps, count_kinds
     from rtmap_cli.maps.store import read_map
     from rtmap_cli.output import emit, log, table
-    from rtmap_cli.tables import refuse_inside
+    from rtmap_cli.tables import refuse_existing, refuse_inside
 
     stream = str(output) == "-"
     if stream and as_json:
         raise UsageError("--json and -o - both want stdout: choose one")
-    if output is not None and not stream and output.exists() and not overwrite:
-        raise BadInput(output, "exists already", "choose another output or pass --overwrite")
     if output is not None and not stream:
         refuse_inside(output, map_path, other)
+        refuse_existing(output, overwrite)
     old, new = read_map(map_path, before), read_map(other or map_path, after)
     check_same_crs(new.crs, old.crs, other or map_path)
     found = compare_maps(old, new, tolerance)

@@ -64,7 +64,16 @@ def command(
         )
     else:
         result["elements"] = rows
-        header = ["id", "class", "vertices", "length m", "sigma m", "existence", "seen", "drives"]
+        header = [
+            "id",
+            "class",
+            "vertices",
+            "length m",
+            "sigma m",
+            "existence",
+            "seen/in view",
+            "drives",
+        ]
         lines = table(header, [_cells(r) for r in rows])
     if not as_json:
         log(f"{map_path}: version {found.version}, {found.crs}, {len(found)} elements")

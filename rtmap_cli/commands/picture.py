@@ -69,12 +69,11 @@ def command(
     from rtmap_cli.steps.infer import MapModel
     from rtmap_cli.steps.infer.levelling import RoadUnder
     from rtmap_cli.steps.picture import draw_views, grid_lines
-    from rtmap_cli.tables import refuse_inside, whole_file
+    from rtmap_cli.tables import refuse_existing, refuse_inside, whole_file
 
     if output.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise BadInput(output, "is not the name of a picture", "end it in .png or .jpg")
-    if output.exists() and not overwrite:
-        raise BadInput(output, "exists already", "choose another output or pass --overwrite")
+    refuse_existing(output, overwrite)
     source = open_log(log_path)
     refuse_inside(output, source.path if source.path.is_dir() else None, map_path, run_path)
     for note in notes_of(source):
@@ -186,9 +185,13 @@ def _of_map(log: Log, frame: Frame, vector_map: VectorMap, where: str) -> list[G
 
 
 def _of_run(log: Log, frame: Frame, path: Path, threshold: float) -> list[GroundLine]:
-    """What a run saw in the frame (confirmed and new elements), on the plane of the road."""
+    """What a run says of the frame, on the plane of the road: confirmed and new elements where it
+    saw them, outdated ones where the map has them."""
+    import numpy as np
+
     from rtmap_cli.errors import BadInput
-    from rtmap_cli.logs.run import OUTDATED, read_run
+    from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, transform, xyyaw_of
+    from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED, read_run
     from rtmap_cli.steps.picture import element_lines
 
     run = read_run(path)
@@ -197,6 +200,12 @@ def _of_run(log: Log, frame: Frame, path: Path, threshold: float) -> list[Ground
     o = run.observations
     if frame.index not in run.frames.frame:
         raise BadInput(path, f"has no frame {frame.index}")
-    rows = (o.frame == frame.index) & (o.state != OUTDATED) & (o.score >= threshold)
-    seen = o.select(rows)
-    return element_lines(list(seen.class_name), list(seen.points))
+    here = o.frame == frame.index
+    gone = o.select(here & (o.state == OUTDATED) & np.isfinite(o.prior_points).all(axis=(1, 2)))
+    ego_SE3_map = invert(se3_from_xyyaw(*xyyaw_of(frame.map_SE3_ego)))
+    places = [transform(ego_SE3_map, np.asarray(p)) for p in gone.prior_points]
+    lines = element_lines(list(gone.class_name), places, "outdated")
+    for state, name in ((MATCHED, "confirmed"), (NEW, "new")):
+        seen = o.select(here & (o.state == state) & (o.score >= threshold))
+        lines += element_lines(list(seen.class_name), list(seen.points), name)
+    return lines

@@ -75,12 +75,13 @@ def command(
         parse_spec,
         truth_json,
     )
-    from rtmap_cli.tables import refuse_over, write_json
+    from rtmap_cli.tables import refuse_existing, refuse_over, write_json
 
     wanted = [parse_spec(text) for text in specs]
-    if truth is not None and truth.exists() and not overwrite:
-        raise BadInput(truth, "exists already", "choose another --truth or pass --overwrite")
+    if truth is not None:
+        refuse_existing(truth, overwrite, "choose another --truth or pass --overwrite")
     refuse_over(output, map_path)
+    refuse_existing(output, overwrite)
     if truth is not None and truth.is_dir():
         raise BadInput(truth, "is a folder, not a file", "choose another --truth")
     old = read_map(map_path, map_version)

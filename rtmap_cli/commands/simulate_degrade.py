@@ -52,9 +52,10 @@ def command(
     from rtmap_cli.maps.store import read_map, write_new_map
     from rtmap_cli.output import emit
     from rtmap_cli.steps.simulate.worlds.degrade import degrade_map
-    from rtmap_cli.tables import refuse_over
+    from rtmap_cli.tables import refuse_existing, refuse_over
 
     refuse_over(output, map_path)
+    refuse_existing(output, overwrite)
     exact = read_map(map_path, map_version)
     degraded = degrade_map(exact, sigma, seed, correlation)
     message = f"simulate degrade: sigma {sigma:g} m, seed {seed}"

@@ -131,12 +131,13 @@ def command(
     from rtmap_cli.steps.simulate.driving.drive_source import TOWN, Route, find_source
     from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
     from rtmap_cli.steps.simulate.worlds.changes import parse_spec
-    from rtmap_cli.tables import refuse_over, whole_folder
+    from rtmap_cli.tables import refuse_existing, refuse_over, whole_folder
 
     wanted = [parse_spec(text) for text in specs]
     in_town = log_path.startswith(TOWN)
     place = Path(log_path.partition(":")[2] or log_path) if in_town else folder_of(log_path)
     refuse_over(output, map_path, place)
+    refuse_existing(output, overwrite)
     vector_map = read_map(map_path, map_version)
     key = DriveKey(world_seed, seed, drive)
     way = Route(route, length, spacing or TOWN_SPACING)

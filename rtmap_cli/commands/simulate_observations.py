@@ -129,11 +129,14 @@ def command(
     from rtmap_cli.steps.simulate.perceiving.observations import observe
     from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
     from rtmap_cli.steps.simulate.perceiving.presets import find_preset
-    from rtmap_cli.tables import refuse_over, whole_folder
+    from rtmap_cli.tables import refuse_existing, refuse_over, whole_folder
 
     model = find_preset(preset)
     key = DriveKey(world_seed, seed, traversal)
     refuse_over(output, map_path, Path(log_path.partition(":")[2] or log_path))
+    refuse_existing(output, overwrite)
+    truth_file = truth_poses or output.parent / f"{output.name}.truth.parquet"
+    refuse_existing(truth_file, overwrite, "choose another --truth-poses or pass --overwrite")
     world = read_map(map_path, map_version)
     prior = read_map(prior_path) if prior_path is not None else None
     drive, source = _drive(log_path, route, route_length, spacing, rate, lateral, key)
@@ -154,8 +157,6 @@ def command(
         "prior_version": prior.version if prior else None,
         "log": log_path, "preset_name": preset, **source,
     }  # fmt: skip
-    truth_file = truth_poses or output.parent / f"{output.name}.truth.parquet"
-    _check_free(truth_file, overwrite)
     with whole_folder(output, overwrite) as folder:
         run, truth = observe(
             world, drive, model, key, label, prior,
@@ -232,13 +233,6 @@ def _check_in_reach(vector_map: VectorMap, drive: Drive, path: Path) -> None:
         raise BadInput(
             path, f"lies out of range of the drive (which starts at {place})", "use its own map"
         )
-
-
-def _check_free(path: Path, overwrite: bool) -> None:
-    from rtmap_cli.errors import BadInput
-
-    if path.exists() and not overwrite:
-        raise BadInput(path, "exists already", "choose another --truth-poses or pass --overwrite")
 
 
 def _write_truth(truth: Poses, path: Path, crs: str) -> None:

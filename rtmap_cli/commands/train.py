@@ -95,6 +95,8 @@ def command(output: Path, config: str, **given: Any) -> int:
 
 
 def _check(output: Path, given: dict[str, Any]) -> None:
+    from rtmap_cli.tables import refuse_existing
+
     training = given["steps"] is not None or given["minutes"] is not None
     if not training and given["frames"] is None and not given["data"]:
         raise UsageError("nothing to do: give --frames or --data, and --steps or --minutes")
@@ -102,8 +104,8 @@ def _check(output: Path, given: dict[str, Any]) -> None:
         for name in ("resume", "init", "validate", "live", "stop_after", "stop_minutes"):
             if given[name]:
                 raise UsageError(f"--{name.replace('_', '-')} needs --steps or --minutes")
-    if training and output.exists() and not given["overwrite"] and given["resume"] is None:
-        raise UsageError(f"{output} exists; pass --overwrite or --resume")
+    if training and given["resume"] is None:
+        refuse_existing(output, given["overwrite"], "pass --overwrite or --resume")
     if given["resume"] is not None and given["init"] is not None:
         raise UsageError("--resume goes on with a run, --init starts one: give one of them")
     if given["init_partial"] and given["init"] is None:

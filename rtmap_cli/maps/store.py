@@ -102,8 +102,8 @@ def write_new_map(
 ) -> int:
     """Write a new map folder as version 0, whole or not at all; returns 0.
 
-    BadInput when ``path`` exists and ``overwrite`` is False, when the CRS is not metric, or when
-    two elements share an id.
+    UsageError when ``path`` exists and ``overwrite`` is False; BadInput when the CRS is not metric,
+    or when two elements share an id.
     """
     check_map_crs(vector_map.crs, path)
     tables = _by_tile(vector_map, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +48,10 @@ def change_events(
 def _event(
     kind: str, evidence: Evidence, stretch: Stretch, log_odds: float, points: Array | None = None
 ) -> ChangeEvent:
-    element = evidence.element
+    element, counts = evidence.element, stretch.counts
     geometry = stretch.geometry if points is None else points
+    # A run that found it from afar had it in view, though too little for "looked and not there".
+    in_view = max(counts.traversals_in_view, counts.traversals_seen)
     return ChangeEvent(
         change_id=_change_id(kind, element.element_id, geometry),
         kind=kind,
@@ -57,7 +60,7 @@ def _event(
         points=geometry,
         probability=float(probability(log_odds)),
         log_odds=float(log_odds),
-        counts=stretch.counts,
+        counts=replace(counts, traversals_in_view=in_view),
     )
 
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.steps.picture.panels import CLASS_COLOURS, INK, OTHER, Colour
+from rtmap_cli.steps.picture.legend import ROW, Colour, Entry, draw_legend, rows_of
+from rtmap_cli.steps.picture.panels import CLASS_COLOURS, INK, OTHER
 
 Array = NDArray[np.float64]
 Box = tuple[float, float, float, float]
@@ -23,6 +24,17 @@ STEP = 0.2
 """m between the points of a line: lenses bend it."""
 FINE_REACH = 12.0
 """m from the vehicle up to which there are lines every metre; farther they fill the picture."""
+ON_ROAD: dict[str, Colour] = CLASS_COLOURS | {"boundary": (190, 190, 205)}
+"""Colours of the classes on asphalt, where the dark grey of the maps would not be seen."""
+EDGES: dict[str, Colour] = {
+    "confirmed": (0, 0, 0),
+    "new": (40, 190, 80),
+    "outdated": (225, 40, 40),
+}
+"""Edges of what a run saw, by state."""
+ON_MAP = "on the map (initial pose)"
+ASPHALT: Colour = (84, 82, 86)
+PAPER: Colour = (240, 240, 240)
 FINE: Colour = (255, 255, 255)
 COARSE: Colour = (60, 220, 235)
 RANGE: Colour = (255, 215, 0)
@@ -42,12 +54,16 @@ class View:
 
 @dataclass(frozen=True)
 class GroundLine:
-    """A line (n, 2) or (n, 3) over the road with its colour and width in pixels."""
+    """A line (n, 2) or (n, 3) over the road with its colour and width in pixels, ``edge`` along
+    it if any; ``name`` and ``state`` stand in the legend. A ``label`` is written in its place."""
 
     points: Array
     colour: Colour
     width: int = 2
     label: str = ""
+    name: str = ""
+    edge: Colour | None = None
+    state: str = ""
 
 
 def grid_lines(box: Box) -> list[GroundLine]:
@@ -57,31 +73,46 @@ def grid_lines(box: Box) -> list[GroundLine]:
     out = []
     near = (max(x0, -FINE_REACH), max(y0, -FINE_REACH), min(x1, FINE_REACH), min(y1, FINE_REACH))
     for spacing, (a, b, c, d), colour in ((1, near, FINE), (5, box, COARSE)):
+        name = f"every {spacing} m"
         xs = np.arange(np.ceil(a / spacing), np.floor(c / spacing) + 1) * spacing
         ys = np.arange(np.ceil(b / spacing), np.floor(d / spacing) + 1) * spacing
-        out += [GroundLine(np.array([[x, b], [x, d]]), colour, 1) for x in xs]
-        out += [GroundLine(np.array([[a, y], [c, y]]), colour, 1) for y in ys]
+        out += [GroundLine(np.array([[x, b], [x, d]]), colour, 1, name=name) for x in xs]
+        out += [GroundLine(np.array([[a, y], [c, y]]), colour, 1, name=name) for y in ys]
     ring = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
-    out.append(GroundLine(ring, RANGE, 3))
+    out.append(GroundLine(ring, RANGE, 3, name="range (numbers: m ahead)"))
     for x in np.arange(np.ceil(x0 / 5), np.floor(x1 / 5) + 1) * 5:
         out.append(GroundLine(np.array([[x, 0.0], [x, 1e-3]]), RANGE, 1, f"{x:g}"))
-    out.append(GroundLine(np.array([[0.0, 0.0], [5.0, 0.0]]), FORWARD, 4))
-    out.append(GroundLine(np.array([[0.0, 0.0], [0.0, 5.0]]), LEFT, 4))
+    out.append(GroundLine(np.array([[0.0, 0.0], [5.0, 0.0]]), FORWARD, 4, name="5 m forward"))
+    out.append(GroundLine(np.array([[0.0, 0.0], [0.0, 5.0]]), LEFT, 4, name="5 m left"))
     return out
 
 
 def element_lines(
-    class_names: Sequence[str], points: Sequence[Array], width: int = 3
+    class_names: Sequence[str], points: Sequence[Array], state: str = ON_MAP
 ) -> list[GroundLine]:
-    """Map elements (n, 2) in the ego frame as lines in the colours of their classes."""
+    """Elements (n, 2) in the ego frame as lines in the colours of their classes.
+
+    Those on a map are thin; those that a run saw have the edge of their ``state`` (of EDGES).
+    """
+    edge, width = EDGES.get(state), 2 if state == ON_MAP else 3
     return [
-        GroundLine(np.asarray(p, np.float64), CLASS_COLOURS.get(name, OTHER), width)
+        GroundLine(
+            np.asarray(p, np.float64), ON_ROAD.get(name, OTHER), width, "", name, edge, state
+        )
         for name, p in zip(class_names, points, strict=True)
     ]
 
 
+def legend_entries(lines: Sequence[GroundLine]) -> list[Entry]:
+    """What the lines of a picture mean: their names, then the states of elements."""
+    names = {x.name: Entry(x.name, x.colour, max(x.width, 2)) for x in lines if x.name}
+    states = {x.state: Entry(x.state, PAPER, x.width, x.edge) for x in lines if x.state}
+    return [*names.values(), *states.values()]
+
+
 def draw_views(views: Sequence[View], lines: Sequence[GroundLine], title: str = "") -> Any:
-    """A picture of all views, three in a row, with the lines drawn into each; returns a PIL image.
+    """A picture of all views, three in a row, with the lines drawn into each and a legend below;
+    returns a PIL image.
 
     All images are shown at the size of the widest.
     """
@@ -92,16 +123,22 @@ def draw_views(views: Sequence[View], lines: Sequence[GroundLine], title: str = 
     height = max(v.image.size[1] for v in views)
     head, gap = 26, 6
     rows = -(-len(views) // columns)
-    size = (columns * (width + gap) + gap, rows * (height + head) + gap + head)
-    out = Image.new("RGB", size, (255, 255, 255))
-    draw = ImageDraw.Draw(out)
+    wide, foot = columns * (width + gap) + gap, rows * (height + head) + gap + head
     font = ImageFont.load_default(size=16)
+    small = ImageFont.load_default(size=14)
+    entries = legend_entries(lines)
+    legend = rows_of(entries, wide - 4 * gap, small) if entries else []
+    out = Image.new("RGB", (wide, foot + ROW * len(legend) + gap * bool(legend)), (255, 255, 255))
+    draw = ImageDraw.Draw(out)
     draw.text((gap, 4), title, fill=INK, font=font)
     for k, view in enumerate(views):
         left = gap + k % columns * (width + gap)
         top = head + k // columns * (height + head)
         draw.text((left, top + 4), view.name, fill=INK, font=font)
         out.paste(_drawn(view, lines), (left, top + head))
+    if legend:
+        draw.rectangle((gap, foot, wide - gap - 1, foot + ROW * len(legend) - 1), fill=ASPHALT)
+        draw_legend(draw, legend, (2 * gap, foot), PAPER, small)
     return out
 
 
@@ -120,6 +157,8 @@ def _drawn(view: View, lines: Sequence[GroundLine]) -> Any:
                 draw.text(tuple(pixels[0]), line.label, fill=line.colour, font=font)
             continue
         for part in _visible(pixels, image.size):
+            if line.edge is not None:
+                draw.line(part, fill=line.edge, width=line.width + 4)
             draw.line(part, fill=line.colour, width=line.width)
     return image
 
