@@ -35,7 +35,8 @@ from rtmap_models.training.train import TrainOptions, train
 from rtmap_cli.steps.evaluate.precision import Scorer
 
 IMAGES = "rtmap-tiny-images"
-VARIANTS: dict[str, dict[str, Any]] = {
+VARIANTS: dict[str, dict[str, Any] | None] = {
+    "start": None,
     "without": {"image_width": 0, "image_heights_m": (), "tilt_sigma": 0.0},
     "with": {},
     "features only": {"tilt_sigma": 0.0},
@@ -78,7 +79,7 @@ def measure(network: Any, frames: Frames, limit: int, lean: float) -> tuple[Arra
         assert batch.plane is not None
         slopes = batch.plane[:, :2]
         guess = torch.zeros_like(slopes)
-        if prediction.tilts is not None and len(prediction.tilts.slopes):
+        if prediction.tilts is not None:
             guess = prediction.tilts.slopes[0]
         before.append(slopes.numpy())
         after.append((slopes - guess).numpy())
@@ -125,7 +126,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1, help="processes")
     parser.add_argument("--lean", type=float, nargs="+", default=[0.0, 0.015], help="slopes, σ")
     parser.add_argument(
-        "--variants", nargs="+", choices=list(VARIANTS), default=["without", "with"]
+        "--variants", nargs="+", choices=list(VARIANTS), default=["start", "without", "with"]
     )
     a = parser.parse_args()
     base = load_config(IMAGES)
@@ -135,13 +136,14 @@ def main() -> None:
     test, leans = Frames(a.data / "test", base), tuple(a.lean)
     head = [f"{what}, leaning {n:g}" for n in leans for what in ("slopes", "left", "mAP")]
     print("| | " + " | ".join(head) + " |\n|---|" + "---|" * len(head), flush=True)
-    torch.manual_seed(0)
-    start = build_network(base)
-    start_from(start, a.init, partial=True)
-    print(row("start", start.eval(), test, a.test_frames, leans), flush=True)
     settings = [f"rate={a.rate}", f"warmup={max(1, a.steps // 8)}", "average=0.99"]
     for name in a.variants:
-        config, path = replace(base, **VARIANTS[name]), a.data / f"{name.replace(' ', '-')}.pt"
+        change, path = VARIANTS[name], a.data / f"{name.replace(' ', '-')}.pt"
+        if change is None:
+            network = build_network(base).eval()
+            start_from(network, a.init, partial=True)
+            print(row(name, network, test, a.test_frames, leans), flush=True)
+            continue
         options = TrainOptions(
             data=(a.data / "train",),
             output=path,
@@ -152,7 +154,7 @@ def main() -> None:
             log_every=20,
             quiet=True,
         )
-        train(config, options, workers=a.threads)
+        train(replace(base, **change), options, workers=a.threads)
         network, _ = load_network(path)
         print(row(name, network, test, a.test_frames, leans), flush=True)
 

@@ -260,7 +260,8 @@ def test_the_head_learns_to_see_a_tilt(config: TinyConfig) -> None:
     optimizer = torch.optim.Adam(branch.parameters(), lr=5e-3)
     losses = []
     for _ in range(120):
-        _, tilts = branch.train_on(images, projections, plane)
+        tilts = branch.learn(images, projections, plane)[1]
+        assert tilts is not None
         loss = tilt_loss(tilts)
         optimizer.zero_grad()
         loss.backward()

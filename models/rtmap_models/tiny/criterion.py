@@ -51,7 +51,7 @@ def compute_losses(prediction: Prediction, batch: Batch, weights: LossWeights) -
     parts["field"] = weights.field * _field(prediction.field, batch)
     heat, shape = _proposals(prediction.proposals, batch)
     parts["heat"], parts["proposal"] = weights.heat * heat, weights.proposal * shape
-    if prediction.tilts is not None and len(prediction.tilts.slopes):
+    if prediction.tilts is not None:
         parts["tilt"] = weights.tilt * tilt_loss(prediction.tilts)
     return parts
 

@@ -39,7 +39,7 @@ class Looked(NamedTuple):
 
 
 class Tilts(NamedTuple):
-    """Guesses of the tilt head in training: ``slopes`` (T, B, 2) of the road in the frames of T
+    """Guesses of the tilt head for its loss: ``slopes`` (T, B, 2) of the road in the frames of T
     sets of cameras, the batch's own first, and ``true`` (T, B, 2), NaN where unknown."""
 
     slopes: Tensor
@@ -68,7 +68,7 @@ class TiltHead(nn.Module):
         so (rise per run)."""
         batch, cameras, _, h, w = features.shape
         rays, per_cell = rays_of(ego_to_image, h, w)
-        flat = torch.hypot(rays[..., 0], rays[..., 1]).clamp(min=1e-6)
+        flat = rays[..., :2].square().sum(-1).sqrt().clamp(min=1e-6)
         # Elevation over the calibrated horizon, in cells: where the horizon should be it is zero.
         above = (rays[..., 2] / flat / per_cell).clamp(-NEAR_CELLS, NEAR_CELLS)
         place = torch.stack([above, torch.exp(-above.square())], dim=2).flatten(0, 1)
@@ -85,22 +85,16 @@ def rays_of(ego_to_image: Tensor, h: int, w: int) -> tuple[Tensor, Tensor]:
 
     Solves M d = (u, v, 1) for ``ego_to_image = [M | p]`` by cross products.
     """
-    e = ego_to_image.float()
-    r0, r1, r2 = (e[..., k, :3] for k in range(3))
-    c12, c20, c01 = (
-        torch.linalg.cross(r1, r2),
-        torch.linalg.cross(r2, r0),
-        torch.linalg.cross(r0, r1),
-    )
-    det = (r0 * c12).sum(-1, keepdim=True)
-    columns = [
-        c / torch.where(det.abs() < 1e-9, torch.ones_like(det), det) for c in (c12, c20, c01)
-    ]
-    across, down, centre = (c[:, :, None, None] for c in columns)
-    u = torch.arange(w, device=e.device, dtype=e.dtype)[:, None] * STRIDE
-    v = torch.arange(h, device=e.device, dtype=e.dtype)[:, None, None] * STRIDE
+    rows = ego_to_image.float()[..., :3].unbind(-2)
+    pairs = ((1, 2), (2, 0), (0, 1))
+    crossed = torch.stack([torch.linalg.cross(rows[i], rows[j]) for i, j in pairs], dim=-2)
+    det = (rows[0] * crossed[..., 0, :]).sum(-1)[..., None, None]
+    inverse = crossed / torch.where(det.abs() < 1e-9, torch.ones_like(det), det)
+    across, down, centre = (inverse[:, :, k, None, None] for k in range(3))
+    u = torch.arange(w, device=det.device, dtype=det.dtype)[:, None] * STRIDE
+    v = torch.arange(h, device=det.device, dtype=det.dtype)[:, None, None] * STRIDE
     # A ray of depth 1 moves by this much from one row of pixels to the next.
-    step = columns[1].square().sum(-1).sqrt()[..., None, None] * STRIDE
+    step = down.square().sum(-1).sqrt() * STRIDE
     return u * across + v * down + centre, step.clamp(min=1e-6)
 
 
@@ -171,26 +165,28 @@ class ImageBranch(nn.Module):
     def forward(self, images: Tensor, ego_to_image: Tensor) -> Looked:
         """``images`` uint8 (B, N, H, W, 3), ``ego_to_image`` (B, N, 3, 4)."""
         features = camera_features(self._features, images, ego_to_image, self.training)
-        return self._look(features, ego_to_image)
+        slopes = None if self.tilt is None else self.tilt(features, ego_to_image)
+        return self._corrected(features, ego_to_image, slopes)
 
-    def train_on(self, images: Tensor, ego_to_image: Tensor, plane: Tensor) -> tuple[Looked, Tilts]:
-        """The same, and what the tilt head says of these cameras and of cameras that lean by more.
+    def learn(
+        self, images: Tensor, ego_to_image: Tensor, plane: Tensor
+    ) -> tuple[Looked, Tilts | None]:
+        """The same, and what the tilt head says, for its loss.
 
-        ``plane`` (B, 3) is the road in the frame of ``ego_to_image``, NaN where unknown. What
-        levelling leaves is little; leaning the projections by ``tilt_sigma`` shows the head more.
+        ``plane`` (B, 3) is the road in the frame of ``ego_to_image``, NaN where unknown. Levelling
+        leaves little to learn from: in training the head also sees the projections leaning by
+        ``tilt_sigma`` more.
         """
         features = camera_features(self._features, images, ego_to_image, self.training)
-        looked = self._look(features, ego_to_image)
-        slopes = plane[:, :2]
         if self.tilt is None:
-            nothing = slopes.new_zeros(0, *slopes.shape)
-            return looked, Tilts(nothing, nothing)
-        more = torch.randn_like(slopes) * self.tilt_sigma
-        guesses = [
-            self.tilt(features, ego_to_image),
-            self.tilt(features, levelled(ego_to_image, more)),
-        ]
-        return looked, Tilts(torch.stack(guesses), torch.stack([slopes, slopes - more]))
+            return self._corrected(features, ego_to_image, None), None
+        true = plane[:, :2]
+        added = [torch.zeros_like(true)]
+        if self.training:
+            added.append(torch.randn_like(true) * self.tilt_sigma)
+        slopes = torch.stack([self.tilt(features, levelled(ego_to_image, q)) for q in added])
+        tilts = Tilts(slopes, torch.stack([true - q for q in added]))
+        return self._corrected(features, ego_to_image, slopes[0]), tilts
 
     def _features(self, images: Tensor) -> Tensor:
         """uint8 (M, H, W, 3) → (M, image_width, H / 8, W / 8); cell i looks at pixel 8 · i."""
@@ -198,9 +194,9 @@ class ImageBranch(nn.Module):
         out: Tensor = self.extract(x.contiguous(memory_format=torch.channels_last))
         return out
 
-    def _look(self, features: Tensor, ego_to_image: Tensor) -> Looked:
-        """Where the cameras look is not learnt through the picture: the tilt has a loss."""
+    def _corrected(self, features: Tensor, ego_to_image: Tensor, slopes: Tensor | None) -> Looked:
+        """Where the cameras look is not learnt through the picture: the slopes have a loss."""
         level = ego_to_image.float()
-        if self.tilt is not None:
-            level = levelled(level, self.tilt(features, level)).detach()
+        if slopes is not None:
+            level = levelled(level, slopes.detach())
         return Looked(level, None if self.lift is None else self.lift(features, level))

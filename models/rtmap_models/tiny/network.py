@@ -101,12 +101,8 @@ class RTMapNet(AnsweringNet):
             if self.image_branch is None:
                 return self.predict(normalize_picture(batch.picture), *prior)
             if batch.images is None or batch.ego_to_image is None or batch.plane is None:
-                raise BadInput(
-                    "frames", "they hold no camera images", "make them for this --config"
-                )
-            looked, tilts = self.image_branch.train_on(
-                batch.images, batch.ego_to_image, batch.plane
-            )
+                raise BadInput("frames", "they hold no camera images", "make them anew")
+            looked, tilts = self.image_branch.learn(batch.images, batch.ego_to_image, batch.plane)
             picture = self._warped(batch.images, looked.ego_to_image)
             return self.predict(picture, *prior, looked.coarse)._replace(tilts=tilts)
 

@@ -19,4 +19,4 @@ class Prediction(NamedTuple):
     segmentation: Tensor  # (B, C, H/2, W/2) logits
     field: Tensor  # (B, C, 2, H/2, W/2) metres to the nearest element of the class
     new_count: int
-    tilts: Tilts | None = None  # in training with a tilt head
+    tilts: Tilts | None = None  # with a tilt head, for its loss
