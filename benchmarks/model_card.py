@@ -27,6 +27,7 @@ from rtmap_models.data.samples import Pieces, Prior, PriorNoise, clip, make_prio
 from scenes import RealMap, Shot, unseen_towns
 from scipy.stats import spearmanr
 
+from rtmap_cli.geometry.poses import se3_from_xyyaw, xyyaw_of
 from rtmap_cli.maps.prior import on_prior
 from rtmap_cli.steps.evaluate.precision import Scorer
 from rtmap_cli.steps.infer.duplicates import fade_duplicates
@@ -60,19 +61,38 @@ def detections(
     ]
 
 
-def run(model: MapModel, config: ModelConfig, shot: Shot, prior: Prior | None) -> dict[str, Any]:
-    """One frame through onnxruntime, levelled as ``rtmap infer`` does."""
+def run(
+    model: MapModel, config: ModelConfig, shot: Shot, prior: Prior | None, looks: int = 1
+) -> dict[str, Any]:
+    """One frame through onnxruntime, levelled as ``rtmap infer`` does; with a prior asked ``looks``
+    times, each time with the prior moved to the pose of the time before."""
     slots = max(1, len(prior.classes) if prior else 0)
     points = np.zeros((1, slots, config.vertex_count, 2), np.float32)
     class_id, mask = np.zeros((1, slots), np.int64), np.zeros((1, slots), np.float32)
     if prior is not None and len(prior.classes):
         points[0], class_id[0], mask[0] = prior.points, prior.classes, 1.0
     cameras = shot.cameras(None if prior is None else prior.delta)
-    return model(shot.view.images[None], cameras[None], points, class_id, mask)
+    pose = np.eye(4)
+    for look in range(looks):
+        if look and prior is not None:
+            points[0, : len(prior.points)] = _moved(prior.points, pose)
+        out = model(shot.view.images[None], cameras[None], points, class_id, mask)
+        pose = pose @ se3_from_xyyaw(*np.asarray(out["pose_delta"][0], np.float64))
+    return out | {"pose_delta": xyyaw_of(pose)[None]}
+
+
+def _moved(points: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (K, V, 2) as seen from a pose (4, 4) given in their frame."""
+    moved: NDArray[np.float64] = (points - pose[:2, 3]) @ pose[:2, :2]
+    return moved
 
 
 def measure(
-    model: MapModel, config: ModelConfig, shots: list[Shot], noise: PriorNoise | None
+    model: MapModel,
+    config: ModelConfig,
+    shots: list[Shot],
+    noise: PriorNoise | None,
+    looks: int = 1,
 ) -> dict[str, Any]:
     """All figures of one set of frames with one kind of prior."""
     rng = np.random.default_rng(1)
@@ -86,7 +106,7 @@ def measure(
         prior = None
         if noise is not None:
             prior = make_prior(view.scene, clip(view.scene, config), config, noise, rng)
-        out = run(model, config, shot, prior)
+        out = run(model, config, shot, prior, looks if prior else 1)
         true = _detections_of(truth.points, truth.classes, config)
         scorer.add(detections(out, config), true)
         if prior is None:
@@ -272,6 +292,7 @@ def main() -> None:
     parser.add_argument("--markdown", action="store_true", help="tables instead of JSON")
     parser.add_argument("--no-level", action="store_true", help="cameras as calibrated")
     parser.add_argument("--priors", choices=("none", "all"), default="all")
+    parser.add_argument("--looks", type=int, default=1, help="as in rtmap infer")
     parser.add_argument("--av2-frames", type=int, default=32, help="per log and kind of place")
     a = parser.parse_args()
     config, model = load_config(a.config), MapModel(str(a.model))
@@ -289,7 +310,7 @@ def main() -> None:
         for prior, noise in PRIORS.items():
             if noise is not None and a.priors == "none":
                 continue
-            report[name][prior] = measure(model, config, views, noise)
+            report[name][prior] = measure(model, config, views, noise, a.looks)
     report["latency"] = latency(a.model, config, sets["unseen towns"][0])
     if a.markdown:
         print("\n".join(tables(report)))

@@ -47,6 +47,13 @@ from rtmap_cli.output import emit, log, progress
     show_default=True,
     help="Turn the cameras to how the road lies, from heights of the map or of the path.",
 )
+@click.option(
+    "--looks",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Ask again with the prior at the pose found: for starts of 2 m and more.",
+)
 @click.option("--skip-bad-frames", is_flag=True, help="Leave out unreadable frames, count them.")
 @options.threads
 @options.overwrite
@@ -64,6 +71,7 @@ def command(
     max_frames: int | None,
     every: int,
     level: bool,
+    looks: int,
     skip_bad_frames: bool,
     threads: int | None,
     overwrite: bool,
@@ -112,6 +120,7 @@ def command(
         max_frames=max_frames,
         every=every,
         level=level,
+        looks=looks,
     )
     started = time.perf_counter()
     total = min(-(-len(source) // every), max_frames or len(source))

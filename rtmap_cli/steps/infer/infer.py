@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput, NoAnswer
 from rtmap_cli.geometry.cameras import levelled
-from rtmap_cli.geometry.poses import se3_from_xyyaw, xyyaw_of, yaw_of
+from rtmap_cli.geometry.poses import se3_from_xyyaw, wrap_angle, xyyaw_of, yaw_of
 from rtmap_cli.logs.log import Frame, Log
 from rtmap_cli.logs.run import (
     MATCHED,
@@ -43,7 +43,8 @@ class InferOptions:
     elements below it are outdated; ``batch``: frames per call; ``threads``: decoding threads;
     ``skip_bad_frames``: leave out frames that cannot be read and count them;
     ``max_frames``: stop after so many; ``every``: take every n-th frame; ``level``: turn the
-    cameras to how the road lies (`RoadUnder`)."""
+    cameras to how the road lies (`RoadUnder`); ``looks``: how often the network is asked, each time
+    with the prior cropped at the pose that the time before gave."""
 
     score_threshold: float = 0.05
     existence_threshold: float = 0.5
@@ -53,6 +54,11 @@ class InferOptions:
     max_frames: int | None = None
     every: int = 1
     level: bool = True
+    looks: int = 1
+
+
+FAR_SIGMAS = 4.0
+"""A pose further than this from the initial one is not trusted with another look."""
 
 
 @dataclass(frozen=True)
@@ -103,12 +109,11 @@ def infer_log(
                     good.append(item)
             if not good:
                 continue
-            slots = [_slots(index, item.frame, model) for item in good]
+            poses, slots, out = _look(model, index, good, options.looks)
             dropped += sum(s.dropped for s in slots)
-            out = _call(model, good, slots)
             for k, item in enumerate(good):
                 parts.append(_observations(model, out, k, item.frame.index, slots[k], options))
-                pose, covariance = _end_to_end(item.frame, out, k, len(slots[k]))
+                pose, covariance = _end_to_end(poses[k], out, k, len(slots[k]))
                 rows.append((item.frame, len(item.images), pose, covariance))
     if not rows:
         raise NoAnswer(f"{log.path}: no frame could be read")
@@ -216,10 +221,40 @@ def _batches(items: Iterable[_Loaded | BadInput], size: int) -> Iterator[list[_L
         yield batch
 
 
-def _slots(index: MapIndex | None, frame: Frame, model: MapModel) -> PriorSlots:
+def _look(
+    model: MapModel, index: MapIndex | None, batch: list[_Loaded], looks: int
+) -> tuple[list[Array], list[PriorSlots], dict[str, Any]]:
+    """Ask the network ``looks`` times. Returns the poses that the prior was cropped at in the end
+    (map_SE3_ego, (4, 4) each), the prior's slots and the answer."""
+
+    def ask() -> tuple[list[PriorSlots], dict[str, Any]]:
+        slots = [_slots(index, pose, model) for pose in poses]
+        return slots, _call(model, batch, slots)
+
+    poses = [item.frame.map_SE3_ego for item in batch]
+    slots, out = ask()
+    for _ in range(looks - 1 if index is not None else 0):
+        poses = [
+            _corrected(item.frame, poses[k], out, k, len(slots[k])) for k, item in enumerate(batch)
+        ]
+        slots, out = ask()
+    return poses, slots, out
+
+
+def _corrected(frame: Frame, at: Array, out: dict[str, Any], k: int, slot_count: int) -> Array:
+    """The pose of the last answer; the initial one where there is none or it went astray."""
+    if not slot_count:
+        return at
+    pose: Array = at @ se3_from_xyyaw(*np.asarray(out["pose_delta"][k], np.float64))
+    moved = xyyaw_of(pose) - xyyaw_of(frame.map_SE3_ego)
+    moved[2] = wrap_angle(moved[2])
+    return pose if (np.abs(moved) < FAR_SIGMAS * frame.sigma).all() else frame.map_SE3_ego
+
+
+def _slots(index: MapIndex | None, pose: Array, model: MapModel) -> PriorSlots:
     info = model.info
-    local = index.crop(frame.map_SE3_ego, info.range_m) if index is not None else []
-    return prior_slots(local, frame.map_SE3_ego, info.classes, info.vertex_count, info.prior_slots)
+    local = index.crop(pose, info.range_m) if index is not None else []
+    return prior_slots(local, pose, info.classes, info.vertex_count, info.prior_slots)
 
 
 def _call(model: MapModel, batch: list[_Loaded], slots: list[PriorSlots]) -> dict[str, Any]:
@@ -286,13 +321,15 @@ def _observations(
     )
 
 
-def _end_to_end(frame: Frame, out: dict[str, Any], k: int, slot_count: int) -> tuple[Array, Array]:
-    """T^E = T⁰ · SE2(δ): x, y, yaw in the map frame and its covariance; NaN without a prior."""
+def _end_to_end(at: Array, out: dict[str, Any], k: int, slot_count: int) -> tuple[Array, Array]:
+    """T^E = T⁰ · SE2(δ): x, y, yaw in the map frame and its covariance; NaN without a prior.
+
+    ``at`` (4, 4) is T⁰, where the prior was cropped."""
     if not slot_count:
         return np.full(3, np.nan), np.full((3, 3), np.nan)
     delta = np.asarray(out["pose_delta"][k], np.float64)
-    pose = frame.map_SE3_ego @ se3_from_xyyaw(delta[0], delta[1], delta[2])
-    yaw = float(yaw_of(frame.map_SE3_ego))
+    pose = at @ se3_from_xyyaw(delta[0], delta[1], delta[2])
+    yaw = float(yaw_of(at))
     turn = np.eye(3)
     turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     return xyyaw_of(pose), turn @ np.asarray(out["pose_covariance"][k], np.float64) @ turn.T
