@@ -98,8 +98,14 @@ def whole_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
             shutil.rmtree(temporary)
 
 
-MARKERS = ("run.json", "log.json", "_delta_log")
+MARKERS = {"run.json": "a run", "log.json": "a log", "_delta_log": "a map"}
 """What tells a run, a log and a map from any other folder."""
+
+
+def taken_for(folder: Path) -> str:
+    """ "it is a map" and the like for a folder that stands in another's place; "" if it is none."""
+    kinds = [kind for name, kind in MARKERS.items() if (folder / name).exists()]
+    return f"it is {kinds[0]}" if kinds else ""
 
 
 def _check_same_kind(old: Path, new: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from sample_logs import write_native_log
 
 from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.logs.run import (
@@ -189,3 +190,17 @@ def test_what_was_taken_for_a_run_is_told(rtmap, tmp_path: Path) -> None:
     assert "it holds runs (monday): name them" in held.err
     colon = ["simulate", "images", "--map", tmp_path / "map", "--log", "town", "-o", tmp_path / "x"]
     assert "town: with a colon" in rtmap(*colon, code=3).err
+
+
+def test_a_run_a_log_and_a_map_in_each_others_place_are_named(
+    rtmap: Call, town: Path, run: Path, tmp_path: Path
+) -> None:
+    log = write_native_log(tmp_path / "log")
+    for call, told in (
+        (("localize", run, "--map", run), "not a map (there is no _delta_log in it); it is a run"),
+        (("map", "ls", log), "it is a log"),
+        (("infer", run, "-o", tmp_path / "x"), "not a log (log.json is missing); it is a run"),
+        (("check-log", town), "it is a map"),
+        (("localize", town, "--map", town), "is no run (run.json is missing); it is a map"),
+    ):
+        assert told in _one_line(rtmap(*call, code=3))

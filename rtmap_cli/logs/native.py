@@ -44,7 +44,7 @@ from rtmap_cli.logs.tables import (
     rig_table,
 )
 from rtmap_cli.maps.crs import check_log_crs
-from rtmap_cli.tables import TableSchema, read_json, write_json, write_table
+from rtmap_cli.tables import TableSchema, read_json, taken_for, write_json, write_table
 
 Array = NDArray[np.float64]
 
@@ -240,7 +240,8 @@ def read_log_info(folder: Path) -> dict[str, Any]:
         raise BadInput(folder, "no such log folder")
     path = folder / "log.json"
     if not path.exists():
-        raise BadInput(folder, "not a log (log.json is missing)", "see docs/log-format.md")
+        todo = taken_for(folder) or "see docs/log-format.md"
+        raise BadInput(folder, "not a log (log.json is missing)", todo)
     info = read_json(path)
     if not isinstance(info, dict) or info.get("schema") != LOG_SCHEMA:
         raise BadInput(path, f"not the log.json of an rtmap log (schema is not {LOG_SCHEMA})")

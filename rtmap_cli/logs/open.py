@@ -11,6 +11,7 @@ from pathlib import Path
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.logs.log import Log
+from rtmap_cli.tables import taken_for
 
 READERS = {
     "av2": ("rtmap_cli.formats.av2.log", "Av2Log"),
@@ -62,7 +63,7 @@ def log_format(spec: str | Path) -> tuple[str, Path]:
     raise BadInput(
         folder,
         f"{what} (neither log.json nor city_SE3_egovehicle.feather in it)",
-        "see docs/log-format.md",
+        taken_for(folder) or "see docs/log-format.md",
     )
 
 

@@ -24,7 +24,14 @@ from numpy.typing import NDArray
 
 from rtmap_cli import __version__
 from rtmap_cli.errors import BadInput
-from rtmap_cli.tables import TableSchema, read_json, read_table, write_json, write_table
+from rtmap_cli.tables import (
+    TableSchema,
+    read_json,
+    read_table,
+    taken_for,
+    write_json,
+    write_table,
+)
 
 Array = NDArray[np.float64]
 
@@ -529,7 +536,7 @@ def _instead_of_run(folder: Path) -> str:
     inside = sorted(path.parent.name for path in folder.glob("*/run.json"))
     if inside:
         return f"it holds runs ({', '.join(inside[:3])}): name them"
-    return "make one with rtmap infer"
+    return taken_for(folder) or "make one with rtmap infer"
 
 
 def read_run_info(folder: str | Path) -> dict[str, Any]:

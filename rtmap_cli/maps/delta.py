@@ -14,7 +14,7 @@ import pyarrow as pa
 from rtmap_cli.errors import BadInput
 from rtmap_cli.maps.place import LOG, TILES, Place
 from rtmap_cli.maps.tiles import TILE, ZOOM, tile_statistics
-from rtmap_cli.tables import read_table
+from rtmap_cli.tables import read_table, taken_for
 
 MAP_FORMAT = "rtmap.map"
 MAP_VERSION = "1.0"
@@ -120,7 +120,7 @@ def open_table(place: Place, version: int | None = None) -> Any:
     if not place.root.exists():
         raise BadInput(place.root, "no such map folder", "make one with `rtmap import`")
     if not (place.root / LOG).is_dir():
-        raise BadInput(place.root, f"not a map (there is no {LOG} in it)")
+        raise BadInput(place.root, f"not a map (there is no {LOG} in it)", taken_for(place.root))
     try:
         table = DeltaTable(place.uri)
         if version is not None and not 0 <= version <= table.version():
