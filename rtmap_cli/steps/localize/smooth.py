@@ -46,7 +46,7 @@ def solve_smooth(
     """
     pose, bias = _start(motion, start)
     spacing = motion.spacing[seen.frame]
-    repeats = np.clip(2.0 * model.element_length_m / spacing, 1.0, _MOST_REPEATS)
+    repeats = np.clip(model.element_length_m / spacing, 1.0, _MOST_REPEATS)
     map_repeats = np.clip(model.map_persist_m / spacing, 1.0, _MOST_REPEATS)
     once = model.element_share + _FIELD_DOUBT * model.place_share
     chunk = chunks(motion.step, settings.chunk_m)
