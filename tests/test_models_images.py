@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,9 @@ from rtmap_models.data.dataset import (  # noqa: E402
     collate,
     make_sample,
     window_size,
-    write_shard,
 )
 from rtmap_models.data.samples import Scene  # noqa: E402
+from rtmap_models.data.views import LEFT_PLANE, Pictures, View  # noqa: E402
 from rtmap_models.export.example import example_inputs  # noqa: E402
 from rtmap_models.tiny.criterion import TILT_UNIT, tilt_loss  # noqa: E402
 from rtmap_models.tiny.image_branch import RIDGE, ImageBranch, TiltHead, Tilts  # noqa: E402
@@ -223,18 +224,31 @@ def test_the_plane_moves_with_the_frame(config: TinyConfig, seed: int) -> None:
 # --- what the head is taught ----------------------------------------------------------------
 
 
-def test_shards_keep_the_plane(config: TinyConfig, tmp_path: Path) -> None:
-    plane = np.array([0.004, -0.002, 0.01])
+def write_frames(folder: Path, config: TinyConfig) -> View:
+    """Two painted frames with images, the plane of the road known in the first; returns it."""
     frame = painted_frame(config)
     assert frame.images is not None and frame.ego_to_image is not None
-    cameras = (frame.images[None], frame.ego_to_image[None])
-    one = (frame.picture[None], [frame.scene], {}, *cameras)
-    write_shard(tmp_path, "a", *one, plane[None])
-    write_shard(tmp_path, "b", *one)
+    road = np.array([0.02, -0.01, 0.1])
+    view = View(frame.images, frame.ego_to_image, frame.scene, np.eye(4), road)
+    pictures = Pictures(config, np.random.default_rng(0), keep_images=True)
+    pictures.add(view)
+    pictures.add(replace(view, plane=None))
+    pictures.write(folder, "painted", {})
+    return view
+
+
+def test_frames_keep_what_levelling_left(config: TinyConfig, tmp_path: Path) -> None:
+    view = write_frames(tmp_path, config)
     frames, rng = Frames(tmp_path, config), np.random.default_rng(0)
     batch = collate([make_sample(frames[k], config, rng, train=False) for k in (0, 1)], config)
-    assert batch.plane is not None
-    np.testing.assert_allclose(batch.plane[0], plane, atol=1e-6)
+    assert batch.plane is not None and batch.ego_to_image is not None and view.plane is not None
+    left = batch.plane[0].numpy()
+    assert 0 < np.abs(left / LEFT_PLANE).max() < 5
+    np.testing.assert_allclose(
+        numpy_cameras.levelled(batch.ego_to_image[0].numpy(), left),
+        numpy_cameras.levelled(view.ego_to_image, view.plane),
+        atol=1e-3,
+    )
     assert batch.plane[1].isnan().all()
 
 
@@ -282,15 +296,14 @@ def test_train_export_infer(rtmap: Any, small: Path, tmp_path: Path) -> None:
     state = build_network(plain).state_dict()
     save_checkpoint(tmp_path / "plain.pt", plain, {"average": state})
     weights, model = tmp_path / "w.pt", tmp_path / "m.onnx"
-    call = ("--config", small, "--data", tmp_path / "frames", "--frames", 2, "--batch", 2)
+    write_frames(tmp_path / "frames", load_config(small))
+    call = ("--config", small, "--data", tmp_path / "frames", "--batch", 2)
     first = ("--init", tmp_path / "plain.pt", "--init-partial", "--steps", 2, "--threads", 1)
     said = rtmap("train", "-o", weights, *call, *first, "--set", "warmup=1", "--device", "cpu")
     assert "start fresh, e.g. image_branch." in said.err
     trained, _ = load_network(weights)
     assert trained.image_branch.tilt.vote.weight[0].abs().max() > 0
     assert trained.image_branch.lift.join.weight.abs().max() > 0
-    frames = Frames(tmp_path / "frames", trained.config)
-    assert frames[0].plane is not None and 0 < np.abs(frames[0].plane).max() < 0.1
     rtmap("export-model", weights, "-o", model, "--report", tmp_path / "r.json")
     report = json.loads((tmp_path / "r.json").read_text())["parity"]
     assert report["within"] and len({r["cameras"] for r in report["rows"]}) == 2

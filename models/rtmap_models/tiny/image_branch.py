@@ -104,7 +104,7 @@ def _plane(direction: Tensor, vote: Tensor, weight: Tensor) -> Tensor:
     x, y = direction[..., 0], direction[..., 1]
 
     def total(value: Tensor) -> Tensor:
-        return (weight * value).flatten(1).sum(dim=1)
+        return (weight * value).sum(dim=(1, 2, 3))
 
     xx, xy, yy = total(x * x) + RIDGE, total(x * y), total(y * y) + RIDGE
     vx, vy = total(vote * x), total(vote * y)
