@@ -31,7 +31,13 @@ from rtmap_models.data.samples import Scene  # noqa: E402
 from rtmap_models.data.views import LEFT_PLANE, Pictures, View  # noqa: E402
 from rtmap_models.export.example import example_inputs  # noqa: E402
 from rtmap_models.tiny.criterion import TILT_UNIT, tilt_loss  # noqa: E402
-from rtmap_models.tiny.image_branch import RIDGE, ImageBranch, TiltHead, Tilts  # noqa: E402
+from rtmap_models.tiny.image_branch import (  # noqa: E402
+    RIDGE,
+    VOTE_CELLS,
+    ImageBranch,
+    TiltHead,
+    Tilts,
+)
 from rtmap_models.training.checkpoint import load_network, start_from  # noqa: E402
 from training_frames import tiny_config  # noqa: E402
 
@@ -189,7 +195,7 @@ def test_votes_of_all_cameras_make_the_plane(config: TinyConfig) -> None:
     higher = SLOPES[0] * np.cos(phi) + SLOPES[1] * np.sin(phi)
     cells = higher / (8.0 * np.linalg.norm(inverse[:, :, 1], axis=1))[:, None, None]
     features = torch.zeros(1, 5, 2, h, w)
-    features[0, :, 0] = torch.from_numpy(cells)
+    features[0, :, 0] = torch.from_numpy(cells / VOTE_CELLS)
     head = TiltHead(2)
     with torch.no_grad():
         head.place.weight.zero_()

@@ -26,6 +26,9 @@ STRIDE = 8
 RIDGE = 0.1
 """Weight of "the cameras do not lean" against the votes of all cells (about 1 per camera)."""
 
+VOTE_CELLS = 8.0
+"""Cells that a vote of 1 means: from zero, small weights must soon reach the size of a tilt."""
+
 NEAR_CELLS = 2.0
 """Cells this far from the calibrated horizon and further look alike to the tilt head."""
 
@@ -76,7 +79,8 @@ class TiltHead(nn.Module):
         out = self.vote(seen).float().reshape(batch, cameras, 2, h, w)
         present = ego_to_image.float().abs().amax(dim=(2, 3)) > 0
         weight = out[:, :, 1].sigmoid() * present[..., None, None].float() * (2.0 / (h * w))
-        return _plane(rays[..., :2] / flat[..., None], out[:, :, 0] * per_cell, weight)
+        vote = out[:, :, 0] * VOTE_CELLS * per_cell
+        return _plane(rays[..., :2] / flat[..., None], vote, weight)
 
 
 def rays_of(ego_to_image: Tensor, h: int, w: int) -> tuple[Tensor, Tensor]:
