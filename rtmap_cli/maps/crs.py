@@ -62,7 +62,7 @@ def parse_crs(crs: str, where: str | Path = "CRS") -> CRS:
         raise BadInput(where, f"{crs!r} is not a CRS", "name one as EPSG:32617") from None
 
 
-def check_map_crs(crs: str, where: str | Path = "CRS") -> str:
+def check_map_crs(crs: str, where: str | Path = "--crs") -> str:
     """``crs`` when it can carry a map frame: projected, metres on both axes; else BadInput."""
     found = parse_crs(crs, where)
     todo = "use a projected CRS in metres, e.g. the UTM zone (EPSG:326xx north, EPSG:327xx south)"

@@ -12,6 +12,8 @@ from rtmap_cli.maps.element import VectorMap
 
 def check_prior_in_range(prior: VectorMap, log: Log, where: str, reach: float = 100.0) -> None:
     """BadInput when no element of the prior comes within ``reach`` metres of any frame."""
+    if not len(prior):
+        raise BadInput(where, "the map is empty", "pass another, or leave out --map")
     index = MapIndex(prior)
     nearest = np.inf
     for frame in log.frames():
@@ -19,9 +21,8 @@ def check_prior_in_range(prior: VectorMap, log: Log, where: str, reach: float = 
         if index.near(x, y, reach):
             return
         b = index.boxes
-        if len(b):
-            dx = np.maximum(np.maximum(b[:, 0] - x, x - b[:, 2]), 0)
-            dy = np.maximum(np.maximum(b[:, 1] - y, y - b[:, 3]), 0)
-            nearest = min(nearest, float(np.hypot(dx, dy).min()))
-    what = "the map is empty" if not len(prior) else f"{nearest:,.0f} m from the nearest frame"
-    raise BadInput(where, f"out of the log's range: {what}", "pass the map of this place")
+        dx = np.maximum(np.maximum(b[:, 0] - x, x - b[:, 2]), 0)
+        dy = np.maximum(np.maximum(b[:, 1] - y, y - b[:, 3]), 0)
+        nearest = min(nearest, float(np.hypot(dx, dy).min()))
+    far = f"{nearest:,.0f} m from the nearest frame"
+    raise BadInput(where, f"out of the log's range: {far}", "pass the map of this place")
