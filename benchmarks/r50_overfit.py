@@ -3,7 +3,7 @@
     python benchmarks/r50_overfit.py --folder DIR --device cuda
     MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=16000000000 MALLOC_TOP_PAD_=67108864 \\
         python benchmarks/r50_overfit.py --folder DIR \\
-        --images 96x160 --batch 2 --many-every 4 --bf16
+        --images 96x160 --batch 2 --many-every 5 --bf16
 
 Renders eight frames of a simulated town, learns them, prints loss and mAP on them with and without
 a prior, writes the ONNX file and prints its parity with torch. What is only there against learning
@@ -133,7 +133,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=FRAMES, choices=(1, 2, 4, 8), help="frames")
     parser.add_argument("--many-every", type=int, default=1)
     parser.add_argument("--steps", type=int, default=300)
-    parser.add_argument("--rate", type=float, default=3e-4)
+    parser.add_argument("--rate", type=float, default=6e-4)
     parser.add_argument("--clip", type=float, default=35.0)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--bf16", action="store_true")
