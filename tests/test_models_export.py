@@ -17,9 +17,12 @@ pytest.importorskip("onnxscript", reason="onnxscript is not installed (extra: tr
 import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
 from rtmap_models.architecture import build_network  # noqa: E402
+from rtmap_models.bev import BLOCK  # noqa: E402
 from rtmap_models.config import load_config  # noqa: E402
 from rtmap_models.export import onnx_file  # noqa: E402
-from rtmap_models.export.gathers import spell_out_grid_samples  # noqa: E402
+from rtmap_models.export.borders import pad_with_zeros  # noqa: E402
+from rtmap_models.export.example import example_inputs  # noqa: E402
+from rtmap_models.export.lean import lean  # noqa: E402
 from rtmap_models.export.onnx_file import read_configuration, read_weights  # noqa: E402
 from rtmap_models.training.checkpoint import load_network, save_checkpoint  # noqa: E402
 from training_frames import tiny_config  # noqa: E402
@@ -180,40 +183,67 @@ def test_places_stay_single_precision(weights: Path, exported: dict[str, Any]) -
     assert "propose.shape.weight" in weights32 and "decoder.layers.0.move.weight.T" in weights32
 
 
-def test_maps_are_read_row_by_row(exported: dict[str, Any]) -> None:
-    """Only the three colours of the images are left to GridSample; the maps' channels are not."""
+def test_every_map_is_sampled_with_zero_padding(exported: dict[str, Any]) -> None:
+    """Once the layers of the decoder and the picture have read theirs."""
     model = onnx.load(exported["path"])
-    kinds = [n.op_type for n in model.graph.node]
-    assert kinds.count("GridSample") == 1
-    assert spell_out_grid_samples(model) == 0
+    samplings = [n for n in model.graph.node if n.op_type == "GridSample"]
+    padding = [a.s for n in samplings for a in n.attribute if a.name == "padding_mode"]
+    assert padding == [b"zeros"] * len(samplings)
+    settings = read_configuration(exported["path"])
+    warped = BLOCK**2 * settings["supersample"] ** 2  # one call per point of a block
+    assert len(samplings) == warped + 3 * settings["layers"]
+    assert pad_with_zeros(model) == 0
 
 
-@pytest.mark.parametrize("channels", [8, 20])
-def test_spelled_out_sampling_equals_the_operator(channels: int) -> None:
+@pytest.mark.parametrize("channels", [3, 20])
+def test_clipped_places_equal_border_padding(channels: int) -> None:
     """At any batch, inside, on the rim and far outside."""
     helper, f32 = onnx.helper, onnx.TensorProto.FLOAT
-    node = helper.make_node("GridSample", ["x", "g"], ["y"], padding_mode="border")
+    nodes = [
+        helper.make_node("GridSample", ["x", "g"], [y], padding_mode=padding)
+        for y, padding in (("y", "border"), ("z", "zeros"))
+    ]
     shapes = {
         "x": ["B", channels, "H", "W"],
         "g": ["B", "h", "w", 2],
         "y": ["B", channels, "h", "w"],
+        "z": ["B", channels, "h", "w"],
     }
-    x, g, y = (helper.make_tensor_value_info(n, f32, s) for n, s in shapes.items())
-    graph = helper.make_graph([node], "sampling", [x, g], [y], value_info=[x])
+    x, g, *out = (helper.make_tensor_value_info(n, f32, s) for n, s in shapes.items())
+    graph = helper.make_graph(nodes, "sampling", [x, g], out)
     opset = [helper.make_opsetid("", 20)]
-    native, spelled = (helper.make_model(graph, opset_imports=opset, ir_version=9) for _ in "ab")
-    assert spell_out_grid_samples(spelled) == 1
-    onnx.checker.check_model(spelled, full_check=True)
+    native, clipped = (helper.make_model(graph, opset_imports=opset, ir_version=9) for _ in "ab")
+    assert pad_with_zeros(clipped) == 1
+    onnx.checker.check_model(clipped, full_check=True)
     rng = np.random.default_rng(0)
     for batch, height, width in ((1, 5, 7), (3, 1, 4)):
         grid = rng.uniform(-1.5, 1.5, (batch, 6, 9, 2)).astype(np.float32)
         grid[:, 0, :4] = [[-1, -1], [1, 1], [1, -1], [0, 0]]
         maps = rng.normal(size=(batch, channels, height, width)).astype(np.float32)
         a, b = (
-            onnxruntime.InferenceSession(m.SerializeToString()).run(None, {"x": maps, "g": grid})[0]
-            for m in (native, spelled)
+            onnxruntime.InferenceSession(m.SerializeToString()).run(None, {"x": maps, "g": grid})
+            for m in (native, clipped)
         )
-        np.testing.assert_allclose(a, b, atol=1e-5)
+        np.testing.assert_allclose(a[0], b[0], atol=1e-5)
+        np.testing.assert_array_equal(a[1], b[1])  # zeros were asked for
+        assert np.abs(a[0] - a[1]).max() > 0.1
+
+
+@pytest.mark.parametrize("size", [(1, 4, 6), (2, 3, 1)])
+def test_what_is_traced_says_what_the_network_says(
+    weights: Path, size: tuple[int, int, int]
+) -> None:
+    network = load_network(weights)[0].eval()
+    inputs = example_inputs(network.config, *size, 3)
+    with torch.no_grad():
+        want = network(*inputs)
+        with lean(network):
+            got = network(*inputs)
+        again = network(*inputs)
+    assert not torch.equal(want.points, got.points)  # it is other code
+    for a, b, c in zip(want, got, again, strict=True):
+        torch.testing.assert_close(b, a, atol=1e-3, rtol=1e-3)
+        assert torch.equal(a, c)
 
 
 def test_a_miss_writes_nothing_and_exits_1(

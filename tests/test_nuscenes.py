@@ -167,7 +167,7 @@ def test_the_map_expansion_becomes_a_map(rtmap: Call, folder: Path, tmp_path: Pa
     )
     states = read_run(tmp_path / "run").observations.element_id
     assert "divider-ld-a" in set(states.tolist())
-    again = rtmap("import", "nuscenes", folder, "-o", tmp_path / "map", code=3)
+    again = rtmap("import", "nuscenes", folder, "-o", tmp_path / "map", code=2)
     assert "exists" in again.err
 
 

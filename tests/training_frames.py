@@ -20,7 +20,7 @@ TINY = {
     "point_width = 48": "point_width = 16",
     "layers = 3": "layers = 1",
     "new_queries = 50": "new_queries = 12",
-    "[128, 224]": "[32, 48]",
+    "[192, 384]": "[32, 48]",
     'name = "rtmap-tiny"': 'name = "rtmap-test"',
 }
 

@@ -22,9 +22,9 @@ def read_tensors(path: Path, what: str, missing: str, broken: str) -> Any:
         raise BadInput(path, "no such file", missing)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.PickleError as error:
-        # torch's own words advise to unpickle whatever it is.
+    except (pickle.PickleError, LookupError, ValueError, EOFError, struct.error) as error:
+        # torch's own words are the unpickler's, or advise to unpickle whatever it is.
         raise BadInput(path, f"not {what}: no file of plain tensors", broken) from error
-    except (RuntimeError, ValueError, LookupError, EOFError, OSError, struct.error) as error:
+    except (RuntimeError, OSError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadInput(path, f"not {what}: {first}", broken) from error

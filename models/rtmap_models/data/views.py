@@ -55,8 +55,11 @@ def wide_picture(warp: BevWarp, view: View) -> NDArray[np.uint8]:
     return picture.round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
 
 
-LEFT_PLANE = np.array([0.0025, 0.0025, 0.015])
+LEFT_PLANE = np.array([0.002, 0.003, 0.015])
 """Standard deviations of what stays wrong after levelling: slopes along x and y, metres."""
+
+LEFT_SPREAD = 0.5
+"""By how much that differs from frame to frame: the spread of the logarithm of a factor."""
 
 
 class Pictures:
@@ -73,7 +76,8 @@ class Pictures:
     def add(self, view: View) -> None:
         """Make the picture of one more view."""
         if view.plane is not None:
-            plane = view.plane + self.rng.normal(0.0, 1.0, 3) * LEFT_PLANE
+            left = LEFT_PLANE * np.exp(self.rng.normal(0.0, LEFT_SPREAD))
+            plane = view.plane + self.rng.normal(0.0, 1.0, 3) * left
             cameras = levelled(view.ego_to_image, plane).astype("f4")
             view = replace(view, ego_to_image=cameras, plane=view.plane - plane)
         self.views.append(view)

@@ -16,9 +16,10 @@ from torch import nn
 
 from rtmap_cli.errors import Findings
 from rtmap_cli.tables import whole_file
+from rtmap_models.export.borders import pad_with_zeros
 from rtmap_models.export.example import example_inputs
-from rtmap_models.export.gathers import spell_out_grid_samples
 from rtmap_models.export.half import to_half
+from rtmap_models.export.lean import lean
 from rtmap_models.export.onnx_weights import (
     CONFIG_KEY,
     keep_weights,
@@ -73,10 +74,10 @@ def export_onnx(
     network = network.eval()
     model = _trace(network)
     _clean(model)
+    pad_with_zeros(model)
     if half:
         to_half(model)
     else:
-        spell_out_grid_samples(model)
         keep_weights(model, network.state_dict())
     _describe(model, network, metadata)
     with whole_file(path) as temporary:
@@ -101,7 +102,7 @@ def _trace(network: nn.Module) -> onnx.ModelProto:
     }
     for name in ("torch.onnx", "onnxscript"):  # what they miss or skip is no news for a user
         logging.getLogger(name).setLevel(logging.ERROR)
-    with torch.no_grad(), warnings.catch_warnings():
+    with torch.no_grad(), warnings.catch_warnings(), lean(network):
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
             network,

@@ -56,8 +56,9 @@ class MapModel:
         options = ort.SessionOptions()
         if threads:
             options.intra_op_num_threads = threads
-        # Threads that wait do not burn the cores that decode the next images.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        # Threads that wait long do not burn the cores that decode the next images.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "1")
+        options.add_session_config_entry("session.intra_op.spin_duration_us", "50")
         options.log_severity_level = 4  # what is fatal is raised as well, in one line
         providers = [p for p in ort.get_available_providers() if p not in NOT_USED]
         try:
