@@ -41,12 +41,16 @@ def solve_smooth(
     What stays at the place for the whole drive is the field, and is solved for; lines are looked
     for where the vertices are without it. Other errors that several frames share are inflated by
     the number of frames that see them: the map's over ``map_persist_m`` of travel, and an
-    element's own offset over ``element_length_m``, this one in the covariance alone: in the
-    solution it would leave to the field what frames can tell from it.
+    element's own offset over ``element_length_m``. Where a detection found its line by itself that
+    enters the covariance alone: in the solution it would leave to the field what frames can tell
+    from it. An answer to a prior query leans on where the prior was put, in every frame alike,
+    and counts once on either side of ``element_length_m``.
     """
     pose, bias = _start(motion, start)
     spacing = motion.spacing[seen.frame]
     repeats = np.clip(model.element_length_m / spacing, 1.0, _MOST_REPEATS)
+    asked = seen.chain >= 0
+    once_asked = np.where(asked, np.minimum(2.0 * repeats, _MOST_REPEATS), 1.0)
     map_repeats = np.clip(model.map_persist_m / spacing, 1.0, _MOST_REPEATS)
     once = model.element_share + _FIELD_DOUBT * model.place_share
     chunk = chunks(motion.step, settings.chunk_m)
@@ -57,7 +61,7 @@ def solve_smooth(
         field = PlaceField(lines, seen, linear, chunk, model, field)
         plain = noise_of(lines, seen, linear, model, once).doubted(linear, doubt)
         judgement = judge(seen, linear, plain, linear.r + field.predict(), model, settings.huber)
-        noise = noise_of(lines, seen, linear, model, model.element_share, map_repeats)
+        noise = noise_of(lines, seen, linear, model, model.element_share * once_asked, map_repeats)
         weight, index = judgement.weight(noise), field.frame_index
         system, _, _ = _system(field, weight, noise, motion, pose, bias)
         step = system.solve()
@@ -65,9 +69,11 @@ def solve_smooth(
         bias = bias + step[index[:, None] + np.arange(3, STATE)]
         field.update(step)
         shift = field.predict()[..., None] * linear.jacobian[..., :2]
+        shift[asked] = 0.0
     if field is None:
         raise ValueError("smooth_gates_m is empty")
-    noise = noise_of(lines, seen, linear, model, model.element_share * repeats, map_repeats)
+    share = model.element_share * np.maximum(repeats, once_asked)
+    noise = noise_of(lines, seen, linear, model, share, map_repeats)
     weight = judgement.weight(noise)
     system, information, chi2 = _system(field, weight, noise, motion, pose, bias)
     used = seen.sum_by_frame(((weight > 0) & (judgement.inlier[:, None] > 0.5)).sum(-1))
