@@ -19,8 +19,7 @@ SURE = 0.3
 """Detections from this score on are counted."""
 ENOUGH_FRAMES, ENOUGH_DETECTIONS = 0.5, 0.2
 """Shares of frames and detections below which a run is said to disagree with a map. On the map of
-their own town 77 to 98 % of the detections of simulated drives are found, on another's 0.5 to 5 %.
-"""
+their own town most detections of simulated drives are found, on another's hardly any."""
 SAMPLE = 1000
 """Detections of a run that are looked at, evenly spread."""
 
