@@ -71,3 +71,35 @@ bbox: Decorator = click.option(
 lonlat: Decorator = click.option(
     "--lonlat", is_flag=True, help="--bbox is west south east north in WGS84 degrees."
 )
+
+
+def gates(command: Callable[..., Any]) -> Callable[..., Any]:
+    """What every ``evaluate`` offers CI; `parse_gates` of ``steps.evaluate.gates`` takes them."""
+    decorators: list[Decorator] = [
+        click.option(
+            "--fail-under",
+            multiple=True,
+            metavar="NAME=VALUE",
+            help="Exit 1 when a figure is lower: mAP=0.5. May be repeated.",
+        ),
+        click.option(
+            "--fail-over",
+            multiple=True,
+            metavar="NAME=VALUE",
+            help="Exit 1 when an error is higher: lateral_m.mean=0.2. May be repeated.",
+        ),
+        click.option(
+            "--baseline", type=PATH, help="An earlier report (--json): exit 1 on what got worse."
+        ),
+        click.option(
+            "--max-drop",
+            multiple=True,
+            metavar="[NAME=]VALUE",
+            help="How much worse than --baseline a figure may be, in its unit (default: 0.01).",
+        ),
+        click.option("--markdown", is_flag=True, help="Print a Markdown table of the figures."),
+        as_json,
+    ]
+    for decorator in reversed(decorators):
+        command = decorator(command)
+    return command
