@@ -20,7 +20,16 @@ from rtmap_cli.logs.run import (
     write_poses,
     write_run,
 )
-from rtmap_cli.steps.evaluate.poses import PoseScore, chi_squares, pool_poses, pose_errors
+from rtmap_cli.steps.evaluate.poses import (
+    PoseScore,
+    chi_squares,
+    effective_count,
+    mean_interval,
+    pool_poses,
+    pose_errors,
+    upright_errors,
+    whitened_errors,
+)
 
 CRS = "EPSG:32617"
 N = 40
@@ -167,7 +176,10 @@ def test_honest_covariances_hold_what_they_say() -> None:
 
     def score(factor: float) -> dict[str, Any]:
         squares = chi_squares(true, estimate, factor * covariance)
-        found = PoseScore(pose_errors(true, estimate), np.full(n, "ok"), squares)
+        whitened = whitened_errors(true, estimate, factor * covariance)
+        upright = upright_errors(true, estimate)
+        errors = pose_errors(true, estimate)
+        found = PoseScore(errors, np.full(n, "ok"), squares, whitened, upright)
         told = pool_poses([found, found]).consistency()
         assert told is not None and told["n"] == 2 * n
         return told
@@ -177,6 +189,65 @@ def test_honest_covariances_hold_what_they_say() -> None:
     for name in ("all", "longitudinal", "lateral", "yaw"):
         assert honest["inside"]["50"][name] == pytest.approx(0.5, abs=0.015)
         assert honest["inside"]["90"][name] == pytest.approx(0.9, abs=0.015)
+    assert honest["verdict"] == "consistent"
+    low, high = honest["nees_interval"]["independent"]
+    assert high - 1 == pytest.approx(1.96 * np.sqrt(2 / (3 * 2 * n)), rel=0.02) and low < 1
+    assert honest["nees_interval"]["n_effective"] == pytest.approx(2 * n, rel=0.05)
     assert score(0.25)["nees"] == pytest.approx(4.0, abs=0.1)
+    assert score(0.25)["verdict"] == "overconfident"
+    assert score(4.0)["verdict"] == "underconfident"
     unknown = chi_squares(true[:2], estimate[:2], np.zeros((2, 3, 3)))
     assert np.isnan(unknown["all"]).all()
+
+
+def test_frames_that_err_alike_count_less() -> None:
+    rng = np.random.default_rng(3)
+    rho, n = 0.9, 400
+    verdicts, worth = [], []
+    for _ in range(200):
+        w = np.empty((n, 3))
+        w[0] = rng.normal(size=3)
+        for k in range(1, n):
+            w[k] = rho * w[k - 1] + np.sqrt(1 - rho**2) * rng.normal(size=3)
+        count = effective_count(w)
+        mean = float((w**2).sum(axis=1).mean() / 3)
+        inside = [low <= mean <= high for low, high in (mean_interval(c, 3) for c in (n, count))]
+        verdicts.append(inside)
+        worth.append(count)
+    alone, alike = np.mean(verdicts, axis=0)
+    # Honest, but as if independent half of the runs would be called liars.
+    assert alone < 0.75 and alike > 0.88
+    # The χ² of an AR(1) correlate by ρ^2k.
+    assert np.median(worth) == pytest.approx(n * (1 - rho**2) / (1 + rho**2), rel=0.2)
+    assert effective_count(np.ones((50, 3))) == pytest.approx(1.0, abs=0.05)
+
+
+def test_height_roll_and_pitch(rtmap: Any, tmp_path: Path) -> None:
+    times, pose = truth()
+    tilt = np.eye(4)
+    angle = np.radians(0.4)
+    tilt[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    nod = np.eye(4)
+    nod[0, 0] = nod[2, 2] = np.cos(angle / 2)
+    nod[0, 2], nod[2, 0] = np.sin(angle / 2), -np.sin(angle / 2)
+    hills = pose.copy()
+    hills[:, 2, 3] = 250.0 + np.arange(N)
+    hills = hills @ tilt
+    up = np.eye(4)
+    up[2, 3] = 0.3
+    got = upright_errors(hills, hills @ up @ nod @ tilt)
+    np.testing.assert_allclose(got, np.tile([0.3, 0.4, 0.2], (N, 1)), atol=1e-9)
+    assert np.isnan(upright_errors(pose, hills)).all()
+    # A run that took them over from its initial poses did not estimate them.
+    run = write(tmp_path)
+    command = ["evaluate", "poses", run, "--truth", tmp_path, "--json"]
+    write_poses(true_poses(np.arange(N, dtype=np.int32), times, hills), tmp_path / "truth", CRS)
+    assert "z_m" not in json.loads(rtmap(*command).out)
+    moved_up = true_poses(np.arange(N, dtype=np.int32), times, hills @ up @ tilt)
+    write_poses(moved_up, run, CRS)
+    got = json.loads(rtmap(*command).out)
+    assert got["z_m"] == pytest.approx({"mean": 0.3, "p90": 0.3})
+    assert got["roll_deg"]["mean"] == pytest.approx(0.4)
+    assert got["pitch_deg"]["mean"] == pytest.approx(0.0, abs=1e-9)
+    told = rtmap("evaluate", "poses", run, "--truth", tmp_path).out
+    assert "roll (°)" in told and "(100.0%)" in told

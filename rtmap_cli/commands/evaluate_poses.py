@@ -46,19 +46,44 @@ def command(run: Path, truth: str, traversal: str | None, initial: bool, as_json
     emit(result, as_json, _lines(result))
 
 
+NAMES = {
+    "lateral_m": "lateral (m)",
+    "longitudinal_m": "longitudinal (m)",
+    "yaw_deg": "yaw (°)",
+    "z_m": "z (m)",
+    "roll_deg": "roll (°)",
+    "pitch_deg": "pitch (°)",
+}
+
+
 def _lines(result: dict[str, Any]) -> list[str]:
     from rtmap_cli.output import table
 
     def show(value: float | None) -> str:
         return "-" if value is None else f"{value:.3f}"
 
-    names = {"lateral_m": "lateral (m)", "longitudinal_m": "longitudinal (m)", "yaw_deg": "yaw (°)"}
-    rows = [[text, show(result[k]["mean"]), show(result[k]["p90"])] for k, text in names.items()]
+    rows = [
+        [text, show(result[k]["mean"]), show(result[k]["p90"])]
+        for k, text in NAMES.items()
+        if k in result
+    ]
     out = table(["error", "mean", "90 %"], rows)
     if "frames" in result:
-        out.append(f"{result['n']} of {result['frames']} frames have an answer")
+        share = "" if result["share_answered"] is None else f" ({result['share_answered']:.1%})"
+        out.append(f"{result['n']} of {result['frames']} frames have an answer{share}")
     if result.get("consistency"):
-        inside = result["consistency"]["inside"]
-        told = ", ".join(f"{v['all']:.1%} in the {k} % region" for k, v in inside.items())
-        out.append(f"truth: {told}")
+        out += _consistency(result["consistency"])
     return out
+
+
+def _consistency(told: dict[str, Any]) -> list[str]:
+    shares = ", ".join(f"{v['all']:.1%} in the {k} % region" for k, v in told["inside"].items())
+    interval = told["nees_interval"]
+    alike, alone = ("{:.2f} … {:.2f}".format(*interval[k]) for k in ("correlated", "independent"))
+    return [
+        f"truth: {shares}",
+        f"covariances: {told['verdict']}; χ² per degree of freedom {told['nees']:.2f}, of honest "
+        f"ones in {interval['level']:.0%} of the cases {alike}",
+        f"  (frames err alike: these {told['n']} are worth {interval['n_effective']:.1f} "
+        f"independent ones; were they independent, {alone})",
+    ]

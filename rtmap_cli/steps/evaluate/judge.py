@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,15 @@ from rtmap_cli.steps.evaluate.changes import (
     score_changes,
 )
 from rtmap_cli.steps.evaluate.drives import Drive, drive_of, read_drives
-from rtmap_cli.steps.evaluate.poses import PoseScore, chi_squares, pose_errors, summarize
+from rtmap_cli.steps.evaluate.poses import (
+    UPRIGHT,
+    PoseScore,
+    chi_squares,
+    pose_errors,
+    summarize,
+    upright_errors,
+    whitened_errors,
+)
 from rtmap_cli.tables import read_json
 
 Array = NDArray[np.float64]
@@ -35,15 +44,53 @@ KINDS = ("insert", "delete", "modify")
 """Changes that can be seen from geometry; others (paint) are not judged."""
 
 
+@dataclass(frozen=True)
+class PosePairs:
+    """True and estimated poses (n, 4, 4) of the frames of a run with their planar covariances
+    (n, 3, 3: x, y in map axes, yaw) and status (n,); ``upright`` as in ``upright_errors``."""
+
+    true: Array
+    estimate: Array
+    covariance: Array
+    status: NDArray[Any]
+    upright: Array
+
+
 def judge_poses(
     run: Run, truth: str | Path, traversal: str | None = None, initial: bool = False
 ) -> PoseScore:
     """Errors of a run's poses against POSES; ``initial`` judges T⁰ and its sigmas instead."""
+    p = pose_pairs(run, truth, traversal, initial)
+    squares = chi_squares(p.true, p.estimate, p.covariance)
+    whitened = whitened_errors(p.true, p.estimate, p.covariance)
+    return PoseScore(pose_errors(p.true, p.estimate), p.status, squares, whitened, p.upright)
+
+
+def pose_pairs(
+    run: Run, truth: str | Path, traversal: str | None = None, initial: bool = False
+) -> PosePairs:
+    """The poses of a run beside those of POSES, by time; ``initial``: T⁰ and its sigmas.
+
+    BadInput when the run has no poses, a frame has no true one, or the CRS differ.
+    """
     where = run.path or run.log_id
     if run.poses is None and not initial:
         raise BadInput(where, "has no poses yet", "run rtmap localize first, or pass --initial")
     drive = drive_of(read_drives(truth, traversal), run.log_id, truth)
-    check_same_crs(run.crs, drive.crs, where)
+    true = true_poses_of(run, drive, truth)
+    estimate, covariance, status = _estimates(run, initial)
+    upright = upright_errors(true, estimate)
+    if not initial:
+        # What the poses took over from the initial ones was not estimated.
+        taken = np.abs(estimate - run.frames.initial)[:, 2] <= 1e-7
+        upright[:, 0] = np.nan if taken[:, 3].all() else upright[:, 0]
+        upright[:, 1:] = np.nan if taken[:, :3].all() else upright[:, 1:]
+    return PosePairs(true, estimate, covariance, status, upright)
+
+
+def true_poses_of(run: Run, drive: Drive, truth: str | Path) -> Array:
+    """(n, 4, 4) poses of a drive at the frames of a run; BadInput when one has none."""
+    check_same_crs(run.crs, drive.crs, run.path or run.log_id)
     true, known = drive.at(run.frames.timestamp_ns)
     if not known.all():
         first = int(run.frames.timestamp_ns[~known][0])
@@ -52,8 +99,7 @@ def judge_poses(
             f"no pose at {first} ns ({int((~known).sum())} of {len(known)} frames have none)",
             f"is it the truth of {run.log_id}?",
         )
-    estimate, covariance, status = _estimates(run, initial)
-    return PoseScore(pose_errors(true, estimate), status, chi_squares(true, estimate, covariance))
+    return true
 
 
 def _estimates(run: Run, initial: bool) -> tuple[Array, Array, NDArray[Any]]:
@@ -85,7 +131,8 @@ def judge_pairs(path: Path, truth: str | Path) -> dict[str, dict[str, Any]]:
             raise BadInput(truth, f"case {name} is missing or has another number of frames")
         estimated = np.array([_pose(path, name, f, "est") for f in frames])
         true = np.array([_pose(Path(truth), name, f, "true") for f in truths[name]])
-        out[name] = summarize(pose_errors(true, estimated))
+        upright = summarize(upright_errors(true, estimated), UPRIGHT)
+        out[name] = upright | summarize(pose_errors(true, estimated))
     return out
 
 
