@@ -13,6 +13,7 @@ import numpy as np
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.maps.crop import Range
+from rtmap_cli.maps.footprint import METADATA_KEY, NOTHING_KNOWN, Footprint, read_footprint
 
 EXPORT_IT = "export it with rtmap export-model (docs/model-contract.md)"
 
@@ -23,6 +24,7 @@ MEANINGS = {
     "rtmap.sigma": "standard deviation, metres",
 }
 """Metadata with one allowed value: everything behind the model counts on it."""
+
 
 SCORE_SLACK = 1e-3
 """What rounding may carry scores beyond 0 … 1."""
@@ -45,6 +47,7 @@ class ModelInfo:
     prior_slots: int
     image_size: tuple[int, int]
     horizon: float
+    footprint: Footprint = NOTHING_KNOWN
 
 
 def inputs_of(info: ModelInfo) -> dict[str, tuple[str, tuple[Axis, ...]]]:
@@ -99,6 +102,7 @@ def read_metadata(path: Path, metadata: Mapping[str, str], sha256: str) -> Model
             prior_slots=whole("rtmap.prior_slots", 1),
             image_size=_pair(json.loads(need("rtmap.image_size"))),
             horizon=float(need("rtmap.horizon")),
+            footprint=read_footprint(json.loads(metadata.get(METADATA_KEY, "null"))),
         )
         _sensible(info)
     except (ValueError, TypeError, KeyError, IndexError) as error:

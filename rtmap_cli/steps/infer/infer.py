@@ -132,6 +132,7 @@ def infer_log(
         source="infer",
         model=model.info.name,
         model_sha256=model.info.sha256,
+        model_footprint=model.info.footprint.as_json(),
         options=asdict(options),
         frames=len(rows),
         skipped_frames=skipped,

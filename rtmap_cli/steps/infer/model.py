@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
+from rtmap_cli.formats.model_file import find_model, first_line
 from rtmap_cli.steps.infer.contract import (
     ModelInfo,
     check_answer,
@@ -24,24 +24,6 @@ __all__ = ["MapModel", "ModelInfo", "find_model"]
 NOT_USED = {"TensorrtExecutionProvider", "AzureExecutionProvider"}
 """The first builds an engine for minutes at every new number of prior elements; the second calls
 remote services, of which the graph has none."""
-
-
-def find_model(name_or_path: str) -> Path:
-    """A file, or a model of the zoo by its name."""
-    path = Path(name_or_path)
-    if path.suffix == ".onnx":
-        if not path.is_file():
-            raise BadInput(path, "no such model file")
-        return path
-    from importlib.util import find_spec
-
-    spec = find_spec("rtmap_models")
-    zoo = Path(spec.origin).parent / "zoo" if spec and spec.origin else Path("zoo")
-    known = sorted(p.stem for p in zoo.glob("*.onnx"))
-    if name_or_path not in known:
-        names = ", ".join(known) or "none"
-        raise BadInput(name_or_path, "no such model", f"in the zoo: {names}; or give a .onnx file")
-    return zoo / f"{name_or_path}.onnx"
 
 
 class MapModel:
@@ -64,7 +46,7 @@ class MapModel:
         try:
             self.session = ort.InferenceSession(content, options, providers=providers)
         except Exception as error:  # onnxruntime raises its own untyped errors
-            raise BadInput(self.path, f"cannot be loaded as ONNX ({_first(error)})") from None
+            raise BadInput(self.path, f"cannot be loaded as ONNX ({first_line(error)})") from None
         metadata = self.session.get_modelmeta().custom_metadata_map
         self.info = read_metadata(self.path, metadata, hashlib.sha256(content).hexdigest())
         check_graph(
@@ -93,13 +75,7 @@ class MapModel:
         try:
             answers = self.session.run(list(self._outputs), feed)
         except Exception as error:  # onnxruntime raises its own untyped errors
-            raise BadInput(self.path, f"the model cannot run ({_first(error)})") from None
+            raise BadInput(self.path, f"the model cannot run ({first_line(error)})") from None
         out = dict(zip(self._outputs, answers, strict=True))
         check_answer(self.path, self.info, out, *prior_mask.shape)
         return out
-
-
-def _first(error: Exception) -> str:
-    """The first line of an error, without onnxruntime's prefix."""
-    line = (str(error).splitlines() or [type(error).__name__])[0]
-    return line.removeprefix("[ONNXRuntimeError] : ")
