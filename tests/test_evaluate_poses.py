@@ -110,6 +110,8 @@ def test_localized_and_initial(rtmap: Any, tmp_path: Path) -> None:
     assert got["all_frames"]["lateral_m"]["mean"] == pytest.approx(0.75 * 0.2 + 0.25 * 2.0)
     before = json.loads(rtmap(*command, "--initial").out)
     assert before["n"] == 40 and before["lateral_m"]["mean"] == pytest.approx(2.0)
+    rtmap(*command, "--fail-over", "lateral_m.mean=0.1", code=1)
+    rtmap(*command, "--fail-over", "lateral_m.mean=0.3", "--fail-under", "share_answered=0.7")
     told = rtmap("evaluate", "poses", run, "--truth", tmp_path / "truth" / "poses.parquet").out
     assert "30 of 40 frames have an answer" in told and "90 % region" in told
 

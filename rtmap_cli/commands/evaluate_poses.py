@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from rtmap_cli import options
+
+if TYPE_CHECKING:
+    from rtmap_cli.steps.evaluate.limits import Figure
 
 
 @click.command("poses")
@@ -17,8 +20,15 @@ from rtmap_cli import options
 )
 @click.option("--traversal", help="Which drive of a fleet poses file (default: by the log id).")
 @click.option("--initial", is_flag=True, help="Judge the initial poses, not the localized ones.")
-@options.as_json
-def command(run: Path, truth: str, traversal: str | None, initial: bool, as_json: bool) -> None:
+@options.gates
+def command(
+    run: Path,
+    truth: str,
+    traversal: str | None,
+    initial: bool,
+    as_json: bool,
+    **gate_options: Any,
+) -> None:
     """Errors of the localized poses of RUN in the true vehicle's own frame.
 
     Mean and 90th percentile over the frames with an answer, the share of those frames, and how
@@ -32,18 +42,41 @@ def command(run: Path, truth: str, traversal: str | None, initial: bool, as_json
     from rtmap_cli.errors import UsageError
     from rtmap_cli.logs.run import read_run
     from rtmap_cli.output import emit
+    from rtmap_cli.steps.evaluate.gates import parse_gates
     from rtmap_cli.steps.evaluate.judge import judge_pairs, judge_poses
 
+    gates = parse_gates(as_json, **gate_options)
+    result: dict[str, Any]
     if run.name.endswith((".json", ".json.gz")):
         if traversal is not None:
             raise UsageError("--traversal names a drive of --truth, pose pairs have none")
         cases = judge_pairs(run, truth)
-        emit(
-            {"cases": cases}, as_json, [line for n, c in cases.items() for line in [n, *_lines(c)]]
-        )
-        return
-    result = judge_poses(read_run(run), truth, traversal, initial).as_json()
-    emit(result, as_json, _lines(result))
+        result = {"cases": cases}
+        lines = [line for name, case in cases.items() for line in (name, *_lines(case))]
+        figures = {f"{n}.{k}": f for n, case in cases.items() for k, f in _figures(case).items()}
+    else:
+        result = judge_poses(read_run(run), truth, traversal, initial).as_json()
+        lines, figures = _lines(result), _figures(result)
+    verdict = gates.verdict("poses", result, figures, {"initial": initial})
+    emit(verdict.result, as_json, verdict.lines(lines))
+    verdict.enforce()
+
+
+def _figures(result: dict[str, Any]) -> dict[str, Figure]:
+    from rtmap_cli.steps.evaluate.limits import Figure
+
+    out = {
+        f"{axis}.{name}": Figure(result[axis][name], "lower")
+        for axis in NAMES
+        if axis in result
+        for name in ("mean", "p90")
+    }
+    if "share_answered" in result:
+        out["share_answered"] = Figure(result["share_answered"])
+    if told := result.get("consistency"):
+        out["nees"] = Figure(told["nees"], "neither")
+        out |= {f"inside.{k}": Figure(v["all"], "neither") for k, v in told["inside"].items()}
+    return out
 
 
 NAMES = {

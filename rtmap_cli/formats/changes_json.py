@@ -35,10 +35,12 @@ class ChangeRecord:
 
 @dataclass(frozen=True)
 class ChangeFile:
-    """Changes of a file; ``area`` is a list of rings (n, 2) lon/lat, None: everywhere."""
+    """Changes of a file; ``area`` is a list of rings (n, 2) lon/lat, None: everywhere; ``runs``
+    the ids of the runs that they were told from, None where the file does not say."""
 
     changes: list[ChangeRecord]
     area: list[Array] | None = None
+    runs: tuple[str, ...] | None = None
 
 
 def read_changes(path: str | Path) -> ChangeFile:
@@ -60,7 +62,15 @@ def read_changes(path: str | Path) -> ChangeFile:
     else:
         raise BadInput(path, "holds neither features nor changes", "see docs/evaluate.md")
     area = data.get("area")
-    return ChangeFile(changes, None if area is None else _area(path, area))
+    return ChangeFile(changes, None if area is None else _area(path, area), _runs(data))
+
+
+def _runs(data: dict[str, Any]) -> tuple[str, ...] | None:
+    told = data.get("rtmap")
+    runs = told.get("runs") if isinstance(told, dict) else None
+    if not isinstance(runs, list) or not all(isinstance(r, str) for r in runs):
+        return None
+    return tuple(runs)
 
 
 def _table(path: Path) -> ChangeFile:

@@ -76,6 +76,33 @@ class ChangeScore:
             out |= {"km": km, "false_per_km": len(self.false) / km}
         return out
 
+    def precision_recall(self) -> dict[str, Any]:
+        """Precision and recall over the threshold on the probability, and the area under them.
+
+        ``curve``: one point per probability that occurs, from the highest down, counting all
+        changes that are at least so probable. Matching goes by falling probability, so that a
+        threshold leaves out the tail and changes nothing before it. ``ap``: area under the
+        precision envelope, summed at every step of recall; equal probabilities are one step. None
+        without true changes.
+        """
+        n = len(self.found) + len(self.missed)
+        if not n:
+            return {"ap": None, "curve": []}
+        judged = [(p.probability, True) for p, _ in self.found]
+        judged += [(c.probability, False) for c in self.false]
+        probability = np.array([p for p, _ in judged])
+        hit = np.array([h for _, h in judged], dtype=bool)
+        curve = []
+        for threshold in np.unique(probability)[::-1].tolist():
+            kept = probability >= threshold
+            tp = int(hit[kept].sum())
+            point = {"threshold": threshold, "found": tp, "false": int(kept.sum()) - tp}
+            curve.append(point | {"precision": tp / int(kept.sum()), "recall": tp / n})
+        recall = np.array([0.0] + [c["recall"] for c in curve])
+        precision = np.array([c["precision"] for c in curve])
+        envelope = np.maximum.accumulate(precision[::-1])[::-1]
+        return {"ap": float((np.diff(recall) * envelope).sum()), "curve": curve}
+
 
 def same_place(predicted: Array, true: Array, class_name: str) -> float:
     """How well two geometries agree, 0 when they do not count as the same.

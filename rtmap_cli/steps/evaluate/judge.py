@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.errors import BadInput
+from rtmap_cli.errors import BadInput, UsageError
 from rtmap_cli.formats.changes_json import ChangeFile, read_changes
 from rtmap_cli.geometry.poses import se3_from_quaternion, se3_from_xyyaw
 from rtmap_cli.logs.run import Run
@@ -23,6 +23,7 @@ from rtmap_cli.steps.evaluate.changes import (
     frame_accuracy,
     score_changes,
 )
+from rtmap_cli.steps.evaluate.detection_time import time_to_detection
 from rtmap_cli.steps.evaluate.drives import Drive, drive_of, read_drives
 from rtmap_cli.steps.evaluate.poses import (
     UPRIGHT,
@@ -33,6 +34,7 @@ from rtmap_cli.steps.evaluate.poses import (
     upright_errors,
     whitened_errors,
 )
+from rtmap_cli.steps.evaluate.sight import STEP, Sight, in_view
 from rtmap_cli.tables import read_json
 
 Array = NDArray[np.float64]
@@ -161,32 +163,90 @@ def _pose(path: Path, case: str, frame: Any, key: str) -> Array:
 
 
 def judge_changes(
-    predicted: str | Path,
+    predicted: str | Path | Sequence[Path],
     truth: str | Path,
     min_probability: float = 0.0,
     drives: Sequence[Drive] = (),
     km: float | None = None,
+    sight: Sight | None = None,
 ) -> dict[str, Any]:
-    """Element-level precision and recall; with ``drives`` also per km and frame by frame."""
-    pred_file, true_file = read_changes(predicted), read_changes(truth)
-    found, crs = in_metres([pred_file, true_file], drives[0].crs if drives else None)
-    pred, true = ([c for c in side if c.kind in KINDS] for side in found)
-    pred = [c for c in pred if c.probability >= min_probability]
-    score = score_changes(pred, true, _area(true_file, crs))
+    """Element-level precision and recall; with ``drives`` also per km and frame by frame.
+
+    Several ``predicted`` files are what was told after ever more traversals: the last one is
+    judged, all of them give the time to detection. ``sight`` adds TbV's visible-only protocol.
+    """
+    paths = [predicted] if isinstance(predicted, str | Path) else list(predicted)
+    files, true_file = [read_changes(path) for path in paths], read_changes(truth)
+    sides, crs = in_metres([*files, true_file], drives[0].crs if drives else None)
+    *told, true = ([c for c in side if c.kind in KINDS] for side in sides)
+    told = [[c for c in side if c.probability >= min_probability] for side in told]
+    area = _area(true_file, crs)
+    scores = [score_changes(side, true, area) for side in told]
+    score = scores[-1]
     km = km if km is not None else (sum(d.kilometres for d in drives) or None)
-    result = score.as_json(km)
-    result["not_judged"] = len(found[1]) - len(true)
+    result = score.as_json(km) | score.precision_recall()
+    result["not_judged"] = len(sides[-1]) - len(true)
     result["by_kind_and_class"] = _breakdown(score)
     result["changes"] = _listing(score)
+    if len(paths) > 1:
+        mode, counts = traversals_of(paths, files)
+        result["time_to_detection"] = {"files": mode, **time_to_detection(scores, true, counts)}
     if drives:
-        xy = np.concatenate([d.pose[:, :2, 3] for d in drives])
-        truly = changed_frames(xy, [c.points for c in true])
-        answers = changed_frames(xy, [c.points for c in pred])
-        result["frame_level"] = {
-            "protocol": f"TbV, all frames, changes nearer than {FRAME_RANGE:g} m",
-            **frame_accuracy(truly, answers),
-        }
+        lines = [[c.points for c in side] for side in (true, told[-1])]
+        result |= _frame_level(drives, lines[0], lines[1], sight)
     return result
+
+
+def _frame_level(
+    drives: Sequence[Drive], true: list[Array], told: list[Array], sight: Sight | None
+) -> dict[str, Any]:
+    """TbV's accuracies over all frames and, with ``sight``, by what was visible."""
+    pose = np.concatenate([d.pose for d in drives])
+    near = [changed_frames(pose[:, :2, 3], events) for events in (true, told)]
+    rule = f"TbV, {{}}, changes nearer than {FRAME_RANGE:g} m"
+    out = {"frame_level": {"protocol": rule.format("all frames"), **frame_accuracy(*near)}}
+    if sight is not None:
+        times = np.concatenate([d.timestamp_ns for d in drives]).tolist()
+        seen = [in_view(times, pose, events, sight) for events in (true, told)]
+        out["frame_level_visible"] = {
+            "protocol": rule.format("visible only"),
+            "visible": f"some point of the change (every {STEP:g} m of it) {sight.told}",
+            **frame_accuracy(*seen),
+        }
+    return out
+
+
+CUMULATIVE, ALONE = "cumulative", "each run alone"
+
+
+def traversals_of(
+    paths: Sequence[str | Path], files: Sequence[ChangeFile]
+) -> tuple[str, list[int]]:
+    """What files in order mean, and how many traversals there had been at each.
+
+    Run folders with what each run says alone (``changes.parquet``) are one traversal each. Other
+    files are told from all runs so far: their own list of runs says how many, else each is one
+    more. BadInput where a file was not told from the runs of the file before it.
+    """
+    alone = [p.is_dir() and not (p / "changes.geojson").exists() for p in map(Path, paths)]
+    if all(alone):
+        return ALONE, list(range(1, len(paths) + 1))
+    if any(alone):
+        raise UsageError(
+            f"{paths[alone.index(True)]} is what a run says alone, "
+            f"{paths[alone.index(False)]} is told from all runs so far: give one kind"
+        )
+    counts: list[int] = []
+    for k, file in enumerate(files):
+        before = files[k - 1].runs if k else None
+        if file.runs is not None and before is not None and not set(before) < set(file.runs):
+            lacking = sorted(set(before) - set(file.runs))
+            what = f"lacks run {lacking[0]} of" if lacking else "has no run more than"
+            raise BadInput(paths[k], f"{what} {paths[k - 1]}", "give the files in order")
+        counts.append(counts[-1] + 1 if counts else 1)
+        if file.runs:
+            counts[-1] = len(set(file.runs))
+    return CUMULATIVE, counts
 
 
 def in_metres(files: list[ChangeFile], crs: str | None) -> tuple[list[list[Change]], str | None]:
@@ -266,7 +326,8 @@ def judge_scenes(predicted: str | Path, truth: str | Path) -> dict[str, Any]:
         raise BadInput(
             truth, f"a scene lacks something ({error})", "see docs/evaluate.md"
         ) from None
-    return frame_accuracy(np.concatenate(truly), np.concatenate(said))
+    protocol = f"TbV, all frames, changes nearer than {FRAME_RANGE:g} m"
+    return {"protocol": protocol, **frame_accuracy(np.concatenate(truly), np.concatenate(said))}
 
 
 def read_scenes(path: str | Path) -> list[dict[str, Any]]:

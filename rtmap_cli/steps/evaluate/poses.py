@@ -207,13 +207,13 @@ class PoseScore:
         }
         nees = float(self.squares["all"][known].mean() / 3)
         n, worth = int(known.sum()), self._worth(known)
+        low, high = alike = mean_interval(worth, 3)
         interval = {
             "level": LEVEL,
             "independent": mean_interval(n, 3),
             "n_effective": worth,
-            "correlated": mean_interval(worth, 3),
+            "correlated": alike,
         }
-        low, high = interval["correlated"]
         verdict = "overconfident" if nees > high else "underconfident"
         return {
             "n": n,
