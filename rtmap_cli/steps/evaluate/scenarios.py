@@ -22,7 +22,7 @@ SCENARIOS = ("straight", "turning", "intersection", "loop", "roundabout", "multi
 
 MULTI_LANE = 3
 """Lanes across the road, both directions together, from which it is multi-lane."""
-ISLAND_AREA = (10.0, 5000.0)
+ISLAND_AREA = (10.0, 1500.0)
 """Central islands of roundabouts have an area between these (m²) …"""
 ISLAND_ROUNDNESS = 0.75
 """… and 4πA/L² of at least this (circle 1, square 0.785)."""
@@ -30,10 +30,8 @@ RING_WIDTH = 15.0
 """The path runs within this distance (m) of the island's mean radius …"""
 TANGENTIAL = 0.8
 """… across the line to its centre (sine of the angle to it) …"""
-RING_BEND = np.radians(60.0)
-"""… and bends by this round it."""
-RING_SPREAD = 0.5
-"""Largest minus smallest distance to the centre, by their mean."""
+RING_BEND = np.radians(30.0)
+"""… and turns by this the way it goes round."""
 FREE_BEND, FREE_RADIUS = np.radians(270.0), (5.0, 40.0)
 """Without an island: bent to one side by this, with a mean radius (m) between these."""
 
@@ -80,9 +78,7 @@ def _round_islands(path: Trajectory, road: RoadMap) -> Bools:
         close = distance <= np.sqrt(island.area / np.pi) + RING_WIDTH
         for sense in (1.0, -1.0):
             for a, b in _runs(close & (sense * round_it >= TANGENTIAL)):
-                bend = sense * (path.yaw[b - 1] - path.yaw[a])
-                spread = np.ptp(distance[a:b]) / distance[a:b].mean()
-                if bend >= RING_BEND and spread <= RING_SPREAD:
+                if sense * (path.yaw[b - 1] - path.yaw[a]) >= RING_BEND:
                     out[a:b] = True
     return out
 
