@@ -103,3 +103,26 @@ def gates(command: Callable[..., Any]) -> Callable[..., Any]:
     for decorator in reversed(decorators):
         command = decorator(command)
     return command
+
+
+def leak_check(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Was the test area seen in training? `check_leak` of ``steps.evaluate.leak`` tells."""
+    decorators: list[Decorator] = [
+        click.option(
+            "--trained-on",
+            multiple=True,
+            metavar="WHAT",
+            help="A model, map or log: how much of the test area was seen in training? Repeatable.",
+        ),
+        click.option("--fail-on-leak", is_flag=True, help="Exit 1 when more than --max-leak was."),
+        click.option(
+            "--max-leak",
+            type=FiniteRange(0, 1),
+            default=0.05,
+            show_default=True,
+            help="Share of the test area that training may have seen.",
+        ),
+    ]
+    for decorator in reversed(decorators):
+        command = decorator(command)
+    return command

@@ -29,8 +29,8 @@ METADATA_KEY = "rtmap.training_footprint"
 ZOOM = 18
 PREFIX = 12
 """Cells are written by their tile of this zoom (about 10 km)."""
-STEP = 12.0
-"""Metres between the points by which an area is taken to cells."""
+STEP = 6.0
+"""Metres between the points by which areas are taken to cells, and measured."""
 
 PLACES, PROCEDURAL, LOCAL, UNKNOWN = "places", "procedural", "local", "unknown"
 ORIGINS = (PLACES, PROCEDURAL, LOCAL, UNKNOWN)
@@ -38,6 +38,8 @@ ORIGINS = (PLACES, PROCEDURAL, LOCAL, UNKNOWN)
 of which nothing is known."""
 
 CHUNK = 2000
+SHIFT = 1 << 24
+"""Squares are numbered from 0 with this added: coordinates of any projected CRS fit."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ def footprint_of_poses(poses: Array, crs: str, range_m: Range) -> Footprint:
         return Footprint(frozenset({LOCAL}))
     cells: set[str] = set()
     for start in range(0, len(poses), CHUNK):
-        points = points_in_range(poses[start : start + CHUNK], range_m, STEP)
+        points = points_in_range(poses[start : start + CHUNK], range_m)
         cells |= set(quadkeys(to_lonlat(crs, points), ZOOM))
     return Footprint(frozenset({PLACES} if cells else ()), frozenset(cells))
 
@@ -133,18 +135,19 @@ def footprint_of_map(vector_map: VectorMap) -> Footprint:
     return Footprint(frozenset({PLACES}), frozenset(keys))
 
 
-def points_in_range(poses: Array, range_m: Range, step: float) -> Array:
-    """(n, 2) map-frame points at most ``step`` metres apart that fill the ranges of frames at
-    ``poses`` (n, 4, 4); where ranges overlap, once per square of that size."""
+def points_in_range(poses: Array, range_m: Range) -> Array:
+    """(n, 2) the middles of the squares of the map frame, ``STEP`` metres wide, that the ranges of
+    frames at ``poses`` (n, 4, 4) touch."""
     x0, y0, x1, y1 = range_m
-    x, y = (np.linspace(a, b, int(np.ceil((b - a) / step)) + 1) for a, b in ((x0, x1), (y0, y1)))
+    x, y = (np.linspace(a, b, int(np.ceil((b - a) / STEP)) + 1) for a, b in ((x0, x1), (y0, y1)))
     box = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    found = np.zeros((0, 2))
+    found = np.zeros(0, np.int64)
     for start in range(0, len(poses), CHUNK):
         here = [transform(pose, box)[:, :2] for pose in poses[start : start + CHUNK]]
-        squares = np.floor(np.concatenate([*here, found]) / step)
-        found = (np.unique(squares, axis=0) + 0.5) * step
-    return found
+        square = np.floor(np.concatenate(here) / STEP).astype(np.int64) + SHIFT
+        found = np.union1d(found, square[:, 0] * 2 * SHIFT + square[:, 1])
+    column, row = np.divmod(found, 2 * SHIFT)
+    return (np.column_stack([column, row]) - SHIFT + 0.5) * STEP
 
 
 def union(footprints: Iterable[Footprint]) -> Footprint:

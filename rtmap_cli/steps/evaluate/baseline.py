@@ -90,8 +90,8 @@ class Baseline:
         for name in [*here, *(k for k in self.settings if k not in here)]:
             if here.get(name) != self.settings.get(name):
                 then, now = (say_setting(s.get(name)) for s in (self.settings, here))
-                what = f"cannot be compared: its {name.replace('_', ' ')} is {then}, here it is"
-                raise BadInput(self.path, f"{what} {now}", "write a baseline that is made alike")
+                what = f"is of another evaluation ({name}: {then} there, {now} here)"
+                raise BadInput(self.path, what, "compare what was made alike")
 
     def changes(self, figures: Figures, drops: Drops) -> list[Change]:
         """Every figure of now, and those of the baseline that are gone, then and now."""
