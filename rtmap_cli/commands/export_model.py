@@ -19,9 +19,13 @@ NEEDS = "the export needs the extra 'train': pip install 'rtmap[train]'"
 @click.option("--name", help="Name of the model (default: the name of its configuration).")
 @click.option(
     "--training-data",
-    default="procedural towns of rtmap",
-    show_default=True,
-    help="What it was trained on, for the metadata.",
+    help="What it was trained on, for the metadata (default: its training footprint in words).",
+)
+@click.option(
+    "--trained-on",
+    multiple=True,
+    metavar="WHAT",
+    help="Where weights were trained that do not say it: 'procedural', frames, logs or maps.",
 )
 @click.option("--licence", default="Apache-2.0", show_default=True, help="For the metadata.")
 @click.option(
@@ -40,7 +44,8 @@ def command(
     weights: Path,
     output: Path,
     name: str | None,
-    training_data: str,
+    training_data: str | None,
+    trained_on: tuple[str, ...],
     licence: str,
     calibrate: Path | None,
     fp16: bool,
@@ -72,12 +77,19 @@ def command(
         raise UsageError(f"{NEEDS} ({error.name} is missing)") from None
     import json
 
-    from rtmap_cli.output import emit, plain
+    from rtmap_cli.output import emit, log, plain
 
     network, content = load_network(weights)
+    footprint = _footprint(weights, network, content, trained_on)
+    if not footprint.known:
+        log(f"rtmap: {weights} was trained on {footprint.text()}: say what with --trained-on")
     factors = _calibrated(network, calibrate)
-    metadata = _metadata(content, name, training_data, licence, factors)
-    result: dict[str, Any] = {"model": str(output), "calibration": factors}
+    metadata = _metadata(content, name, training_data, licence, factors, footprint)
+    result: dict[str, Any] = {
+        "model": str(output),
+        "calibration": factors,
+        "training_footprint": footprint.as_json(),
+    }
     try:
         parity = export_onnx(network, output, metadata, half=fp16)
     except ParityMiss as miss:
@@ -93,19 +105,43 @@ def command(
     emit(result, as_json, [*parity.lines(), f"{output}: {megabytes:.1f} MB"])
 
 
+def _footprint(
+    weights: Path, network: Any, content: dict[str, Any], stated: tuple[str, ...]
+) -> Any:
+    """What training saw, as the checkpoint says; what it does not know as the caller states it."""
+    from rtmap_models.data.dataset import Frames
+    from rtmap_models.data.sources import is_frame_folder
+    from rtmap_models.training.checkpoint import footprint_of
+
+    from rtmap_cli.maps.footprint import TOWNS, union
+    from rtmap_cli.steps.evaluate.leak import read_trained_on
+
+    def read(spec: str) -> Any:
+        if spec == "procedural":
+            return TOWNS
+        if is_frame_folder(Path(spec)):
+            return Frames(spec, network.config).footprint()
+        return read_trained_on([spec])
+
+    found = footprint_of(content, weights)
+    return found.stated(union(map(read, stated))) if stated else found
+
+
 def _metadata(
     content: dict[str, Any],
     name: str | None,
-    training_data: str,
+    training_data: str | None,
     licence: str,
     factors: dict[str, Any],
+    footprint: Any,
 ) -> dict[str, Any]:
     """What the checkpoint and the caller say about the model."""
     from rtmap_models.export.onnx_file import code_version
 
     amount = f"{content['frames']} frames, {content['samples']} samples"
     metadata: dict[str, Any] = {
-        "training_data": f"{training_data}: {amount}",
+        "training_data": f"{training_data or footprint.text()}: {amount}",
+        "training_footprint": footprint.as_json(),
         "training": {k: content[k] for k in ("step", "samples", "frames", "seconds")},
         "licence": licence,
         "code_sha": code_version(),

@@ -7,7 +7,8 @@ A folder holds shards; a shard is a few files that appear whole:
 ``NAME.images.npy``  uint8 (n, N, H, W, 3) camera images (optional; networks that look at them)
 ``NAME.npz``         the elements of each frame; with images, their projections (n, N, 3, 4) and the
                      road's plane in them (n, 3), NaN where unknown
-``NAME.json``        written last: says what the others are
+``NAME.json``        written last: says what the others are and where they come from: ``town`` (its
+                     seed), or ``log`` with the ``footprint`` of its frames
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
+from rtmap_cli.maps.footprint import TOWNS, Footprint, read_footprint, union
 from rtmap_cli.tables import whole_file
 from rtmap_models.config import ModelConfig
 from rtmap_models.data.samples import Array, Scene
@@ -116,8 +118,9 @@ class _Shard:
             self.images = None
             if config.needs_images and images.exists():
                 self.images = np.load(images, mmap_mode="r", allow_pickle=False)
-            json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError, KeyError, EOFError) as error:
+            info = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+            self.footprint = TOWNS if "town" in info else read_footprint(info.get("footprint"))
+        except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError) as error:
             raise BadInput(self.path, f"unreadable shard: {error}", "delete it") from error
         self.start = np.concatenate([[0], np.cumsum(self.table["length"])])
         self._check(config)
@@ -201,6 +204,10 @@ class Frames:
             if (folder / f"{name}.json").exists():
                 raise
             return None  # it went away meanwhile
+
+    def footprint(self) -> Footprint:
+        """Where the frames that are there now come from."""
+        return union(shard.footprint for shard in self.order)
 
     def __len__(self) -> int:
         return int(self.starts[-1])

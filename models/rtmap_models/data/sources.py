@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.cameras import levelled
+from rtmap_cli.logs.footprint import footprint_of_log
 from rtmap_cli.logs.log import Frame, Log
 from rtmap_cli.logs.open import log_format, open_log
 from rtmap_cli.maps.crop import MapIndex
@@ -179,7 +180,10 @@ def make_frames(job: LogJob) -> int:
             pictures = Pictures(job.config, np.random.default_rng(number), job.keep_images)
             for view in views:
                 pictures.add(view)
-            pictures.write(folder, f"frames-{number:05d}", {"log": log.log_id})
+            seen = np.stack([view.map_SE3_ego for view in views])
+            footprint = footprint_of_log(log, job.config.range_m, seen)
+            info = {"log": log.log_id, "footprint": footprint.as_json()}
+            pictures.write(folder, f"frames-{number:05d}", info)
             count += len(views)
         if not count:
             raise BadInput(log.path, "no frame has images", "train on a log with images")

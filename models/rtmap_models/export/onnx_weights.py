@@ -99,6 +99,11 @@ def read_configuration(path: Path) -> dict[str, Any] | None:
     return values if isinstance(values, dict) else None
 
 
+def read_metadata(path: Path) -> dict[str, str]:
+    """What an ONNX file says of itself. BadInput when it is missing or no ONNX."""
+    return _metadata(_load(path))
+
+
 def state_digest(values: Mapping[str, Array]) -> str:
     """SHA-256 of a state dict: names, types, shapes and bytes, in the order of the names."""
     digest = hashlib.sha256()

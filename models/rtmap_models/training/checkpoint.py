@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from rtmap_cli.errors import BadInput
+from rtmap_cli.formats.model_file import find_model
+from rtmap_cli.maps.footprint import METADATA_KEY, Footprint, read_footprint
 from rtmap_cli.tables import whole_file
 from rtmap_models.architecture import build_network
 from rtmap_models.config import ModelConfig, config_from_dict
@@ -71,7 +74,7 @@ def start_from(network: nn.Module, source: str, partial: bool = False) -> list[s
     BadInput when names or shapes differ from the network's (another configuration); with
     ``partial`` what differs keeps its fresh value, and its names are returned.
     """
-    state = _read_state(source)
+    state = _read_state(_weights_file(source))
     own = network.state_dict()
     fitting = {k: v for k, v in state.items() if k in own and v.shape == own[k].shape}
     odd = sorted((own.keys() | state.keys()) - fitting.keys())
@@ -94,12 +97,35 @@ def _misfit(name: str, state: Mapping[str, Tensor], own: Mapping[str, Tensor]) -
     return f"{name}: there {shape(state)}, here {shape(own)}"
 
 
-def _read_state(source: str) -> Mapping[str, Tensor]:
-    path = Path(source)
-    if path.suffix != ".onnx" and not path.exists() and "/" not in source and not path.suffix:
-        from rtmap_cli.steps.infer.model import find_model
+def footprint_of(content: Mapping[str, Any], where: str | Path) -> Footprint:
+    """What the training behind a checkpoint saw; unknown in those written before it was noted."""
+    try:
+        return read_footprint(content.get("footprint"))
+    except ValueError as error:
+        raise BadInput(where, f"not a checkpoint: {error}", "train again") from None
 
-        path = find_model(source)
+
+def footprint_of_source(source: str) -> Footprint:
+    """The same of what ``start_from`` takes."""
+    path = _weights_file(source)
+    if path.suffix != ".onnx":
+        return footprint_of(load_checkpoint(path)[1], path)
+    from rtmap_models.export.onnx_weights import read_metadata
+
+    text = read_metadata(path).get(METADATA_KEY, "null")
+    try:
+        return read_footprint(json.loads(text))
+    except ValueError as error:
+        raise BadInput(path, f"its metadata make no sense ({error})", "export it again") from None
+
+
+def _weights_file(source: str) -> Path:
+    path = Path(source)
+    named = path.suffix != ".onnx" and not path.exists() and "/" not in source and not path.suffix
+    return find_model(source) if named else path
+
+
+def _read_state(path: Path) -> Mapping[str, Tensor]:
     if path.suffix == ".onnx":
         from rtmap_models.export.onnx_weights import read_weights
 

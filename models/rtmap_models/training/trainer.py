@@ -13,11 +13,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rtmap_cli.maps.footprint import Footprint
 from rtmap_cli.output import log
 from rtmap_models.architecture import build_network
 from rtmap_models.config import ModelConfig
 from rtmap_models.data.dataset import Batch, Frames
-from rtmap_models.training.checkpoint import load_resumable, save_checkpoint, start_from
+from rtmap_models.training.checkpoint import (
+    footprint_of,
+    footprint_of_source,
+    load_resumable,
+    save_checkpoint,
+    start_from,
+)
 from rtmap_models.training.distributed import Group, StopSignals
 from rtmap_models.training.feed import Feed
 from rtmap_models.training.journal import Journal
@@ -87,8 +94,10 @@ class Trainer:
         self.recipe = options.recipe
         self.feed = Feed(options.data, config, options.recipe, options.seed, group.rank)
         network = build_network(config)
+        self.footprint = Footprint()
         if options.init is not None and options.resume is None:
             self._say_fresh(start_from(network, options.init, options.init_partial))
+            self.footprint = footprint_of_source(options.init)
         network = network.to(device=group.device, memory_format=torch.channels_last)
         self.network: Any = network.train()
         self.parameters = [p for p in network.parameters() if p.requires_grad]
@@ -110,6 +119,9 @@ class Trainer:
         if group.rank == 0:
             self.journal = self._open_journal()
             self.held_out = Frames(options.validate, config) if options.validate else None
+            self.footprint |= self.feed.frames.footprint()
+            if not options.quiet:
+                log(f"training footprint: {self.footprint.text()}")
 
     def run(self) -> dict[str, Any]:
         """Train to the end of the budget; says where it stands then."""
@@ -222,6 +234,7 @@ class Trainer:
                 save_checkpoint(best, self.config, self._average_content() | {"figures": figures})
 
     def _average_content(self) -> dict[str, Any]:
+        self.footprint |= self.feed.frames.footprint()
         return {
             "average": self.average.state_dict(),
             "step": self.step,
@@ -229,6 +242,7 @@ class Trainer:
             "seconds": self.seconds(),
             "frames": len(self.feed.frames),
             "options": self.options.summary(),
+            "footprint": self.footprint.as_json(),
         }
 
     def save(self) -> None:
@@ -248,6 +262,7 @@ class Trainer:
             self.average.load_state_dict(content["average"])
         self.step, self.before = int(content["step"]), float(content["seconds"])
         self.samples, self.best = int(content["samples"]), float(content.get("best", -1.0))
+        self.footprint = footprint_of(content, path)
 
     def _open_journal(self) -> Journal:
         resume = self.options.resume
