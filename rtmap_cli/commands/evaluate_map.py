@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
 from rtmap_cli import options
-
-if TYPE_CHECKING:
-    from rtmap_cli.steps.evaluate.precision import MapScore
 
 PROTOCOLS = ("rtmap", "maptr", "streammapnet")
 
@@ -43,14 +40,31 @@ PROTOCOLS = ("rtmap", "maptr", "streammapnet")
     type=options.FiniteRange(1),
     help="Compare two maps as a whole, by cells of this edge (m), not by frames.",
 )
-@options.map_version
+@click.option("--by", type=click.Choice(["scenario"]), help="Also AP per scenario of the frames.")
 @click.option(
-    "--fail-under",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Exit 1 when a figure is lower: mAP=0.5, AP.divider=0.6. May be repeated.",
+    "--scenario-map", help="The map that tells scenarios, where --truth is not one (with --poses)."
 )
-@options.as_json
+@click.option(
+    "--bootstrap",
+    type=click.IntRange(0),
+    default=0,
+    metavar="N",
+    help="95 % intervals from N draws of blocks of frames.",
+)
+@click.option(
+    "--block",
+    type=click.IntRange(1),
+    default=20,
+    show_default=True,
+    help="Consecutive frames of a log in a block.",
+)
+@options.seed
+@click.option("--shape", is_flag=True, help="Also smoothness and topology (not part of mAP).")
+@click.option(
+    "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes; same answer."
+)
+@options.map_version
+@options.gates
 def command(
     pred: str,
     truth: str,
@@ -62,9 +76,16 @@ def command(
     size: tuple[float, float] | None,
     every: int,
     cells: float | None,
+    by: str | None,
+    scenario_map: str | None,
+    bootstrap: int,
+    block: int,
+    seed: int,
+    shape: bool,
+    jobs: int,
     map_version: int | None,
-    fail_under: tuple[str, ...],
     as_json: bool,
+    **gate_options: Any,
 ) -> None:
     """Average precision of PRED.
 
@@ -78,13 +99,16 @@ def command(
     """
     from rtmap_cli.errors import UsageError
     from rtmap_cli.output import emit, log
-    from rtmap_cli.steps.evaluate.compare import Settings, compare, missing_frames, read_side
+    from rtmap_cli.steps.evaluate.compare import Settings, compare_frames, read_side
     from rtmap_cli.steps.evaluate.drives import read_drives
-    from rtmap_cli.steps.evaluate.limits import check_limits, check_names, parse_limits
+    from rtmap_cli.steps.evaluate.gates import parse_gates
+    from rtmap_cli.steps.evaluate.report import Wanted, report, scenario_labels
 
+    gates = parse_gates(as_json, **gate_options)
     if traversal is not None and poses is None:
         raise UsageError("--traversal names a drive of --poses: pass both")
-    limits = parse_limits(fail_under)
+    if (by or scenario_map) and (poses is None or cells):
+        raise UsageError("scenarios are those of frames of a drive: pass --poses, and no --cells")
     drives = read_drives(poses, traversal) if poses else []
     settings = Settings(
         protocol=protocol,
@@ -93,19 +117,21 @@ def command(
         range_m=(-size[0] / 2, -size[1] / 2, size[0] / 2, size[1] / 2) if size else None,
         every=every,
         cell=cells,
+        shape=shape,
+        jobs=jobs,
     )
     sides = read_side(pred, True, drives, map_version), read_side(truth, False, drives)
-    score = compare(*sides, drives, settings)
-    figures = {"mAP": score.mAP} | {f"AP.{name}": c.mean for name, c in score.classes.items()}
-    check_names(limits, list(figures))
-    if score.without_truth:
-        names = ", ".join(score.without_truth)
-        log(f"rtmap: no true element of {names}: its AP is 0 by the protocol's rule")
-    lacking = missing_frames(*sides)
-    if lacking:
-        log(f"rtmap: {pred} lacks {lacking} frames of {truth}: they count as empty")
-    emit(score.as_json(), as_json, _lines(score))
-    check_limits(limits, dict(figures))
+    compared = compare_frames(*sides, drives, settings)
+    labels = None
+    if by:
+        source = read_side(scenario_map, False, drives) if scenario_map else sides[1]
+        labels = scenario_labels(compared, drives, source)
+    found = report(compared, Wanted(labels, bootstrap, block, seed, shape))
+    for note in found.notes:
+        log(f"rtmap: {note}")
+    verdict = gates.verdict("map", found.result, found.figures, found.settings)
+    emit(verdict.result, as_json, verdict.lines(found.lines()))
+    verdict.enforce()
 
 
 def parse_thresholds(text: str) -> list[float]:
@@ -119,15 +145,3 @@ def parse_thresholds(text: str) -> list[float]:
     if not values or not all(0 < v < float("inf") for v in values):
         raise UsageError(f"--thresholds {text}: expected metres, e.g. 0.5,1.0,1.5")
     return values
-
-
-def _lines(score: MapScore) -> list[str]:
-    from rtmap_cli.output import table
-
-    thresholds = [str(t) for t in next(iter(score.classes.values())).ap]
-    rows = [
-        [name, *(f"{v:.4f}" for v in c.ap.values()), f"{c.mean:.4f}", c.num_gt, c.num_pred]
-        for name, c in score.classes.items()
-    ]
-    header = ["class", *(f"AP@{t}" for t in thresholds), "AP", "true", "predicted"]
-    return [*table(header, rows), f"mAP {score.mAP:.4f} ({score.protocol}, {score.frames} frames)"]

@@ -150,6 +150,8 @@ def _element(
         raise BadInput(path, f"{where}: {points_key} is not a list of [x, y]")
     if not np.isfinite(points[:, :2]).all():
         raise BadInput(path, f"{where}: {points_key} is not finite")
+    if not scored and len(points) < 2:
+        raise BadInput(path, f"{where}: {points_key} has fewer than 2 vertices")
     score = element.get(score_key, None if scored else 1.0)
     if isinstance(score, bool) or not isinstance(score, int | float):
         raise BadInput(path, f"{where}: {score_key} is missing or not a number")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,27 +12,33 @@ from numpy.typing import NDArray
 from rtmap_cli.errors import BadInput, NoAnswer, UsageError
 from rtmap_cli.maps.crop import Range
 from rtmap_cli.maps.element import CLASSES, VectorMap
-from rtmap_cli.steps.evaluate.drives import Drive
+from rtmap_cli.steps.evaluate.drives import Drive, drive_of
 from rtmap_cli.steps.evaluate.frames import (
     FrameSet,
     MapSide,
     aligned,
+    check_classes,
     in_crs,
     poses_of_keys,
     run_frames,
+    split_key,
 )
+from rtmap_cli.steps.evaluate.pairs import Pairs
+from rtmap_cli.steps.evaluate.parallel import judge_all
 from rtmap_cli.steps.evaluate.precision import (
     PROTOCOLS,
     THRESHOLDS,
     Detection,
+    Judged,
     MapScore,
     Scorer,
 )
+from rtmap_cli.steps.evaluate.scenarios import SCENARIOS, scenarios_of
 from rtmap_cli.steps.evaluate.whole import cell_range, cells_in, region_in_range
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 Side = FrameSet | VectorMap
-Pair = tuple[str, list[Detection], list[Detection]]
 
 
 @dataclass(frozen=True)
@@ -40,7 +46,7 @@ class Settings:
     """How to compare. ``range_m`` and ``classes`` None: as the sides state them.
 
     ``every`` takes every n-th frame; ``cell`` (m) judges two maps by cells of that size in place
-    of frames.
+    of frames. ``shape`` also measures smoothness and topology; ``jobs`` processes share the work.
     """
 
     protocol: str = "rtmap"
@@ -49,6 +55,17 @@ class Settings:
     range_m: Range | None = None
     every: int = 1
     cell: float | None = None
+    shape: bool = False
+    jobs: int = 1
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What was judged: the frames' keys, in order, their scores and what deserves a warning."""
+
+    keys: list[str]
+    scorer: Scorer
+    notes: list[str] = field(default_factory=list)
 
 
 def read_side(
@@ -73,7 +90,10 @@ def read_side(
         frames: dict[str, list[Detection]] = found.frames
         return FrameSet(frames, found.classes, found.range_m, str(path))
     if "://" in str(path) or map_exists(path):
-        return read_map(path, version)
+        found_map = read_map(path, version)
+        if not scored and not len(found_map):
+            raise BadInput(path, "is an empty truth: a map without elements")
+        return found_map
     what = "is no run, map or JSON file of frames" if local.exists() else "no such file or folder"
     raise BadInput(path, what)
 
@@ -85,29 +105,78 @@ def compare(
 
     A map is cropped at the poses of ``drives``: at the frames of the other side, found by time, or
     at every n-th pose when both are maps. Raises UsageError without drives where they are needed,
-    BadInput when frames or poses do not correspond, NoAnswer when nothing lies in range.
+    BadInput when frames, classes or poses do not correspond or the truth is empty, NoAnswer when
+    nothing lies in range.
     """
+    return compare_frames(pred, truth, drives, settings).scorer.result()
+
+
+def compare_frames(
+    pred: Side, truth: Side, drives: list[Drive], settings: Settings | None = None
+) -> Comparison:
+    """As ``compare``, with everything that is kept of each frame."""
     s = settings or Settings()
-    scorer = Scorer(_classes(pred, truth, s), s.thresholds, s.protocol)
-    counts = [0, 0]
-    for key, predicted, true in _pairs(pred, truth, drives, s):
-        counts[0] += len(predicted)
-        counts[1] += len(true)
-        scorer.add(predicted, true, key)
+    scorer = Scorer(_classes(pred, truth, s), s.thresholds, s.protocol, s.shape)
+    out = Comparison([], scorer, _notes(pred, truth, s, scorer.classes))
+    pairs = pairs_of(pred, truth, drives, s)
+    counts = np.zeros(3, np.int64)
+    for key, judged, found in judge_all(pairs, _Judge(scorer), s.jobs):
+        out.keys.append(key)
+        scorer.collect(judged)
+        counts += found
     if not scorer.frames:
         raise NoAnswer("there is no frame to compare")
     if not counts[1] and isinstance(truth, VectorMap):
         raise NoAnswer("nothing of the true map lies in range of the poses")
     if not counts[0] and isinstance(pred, VectorMap) and len(pred):
         raise NoAnswer("nothing of the predicted map lies in range of the poses")
-    return scorer.result()
+    if counts[2] and scorer.protocol.drop_single:
+        out.notes.append(f"{counts[2]} predictions of one vertex are left out by the protocol")
+    return out
 
 
-def missing_frames(pred: Side, truth: Side) -> int:
-    """Frames of the truth that a prediction by frames says nothing about: they count as empty."""
-    if isinstance(pred, FrameSet) and isinstance(truth, FrameSet):
-        return len(truth.frames) - len(pred.frames)
-    return 0
+class _Judge:
+    """Judges frames in any process; gives key, what was found by class, and counts of elements:
+    predicted, true, predicted of one vertex."""
+
+    def __init__(self, scorer: Scorer) -> None:
+        self.scorer = Scorer(
+            scorer.classes, scorer.thresholds.tolist(), scorer.protocol.name, scorer.shape
+        )
+
+    def __call__(
+        self, key: str, pred: list[Detection], true: list[Detection]
+    ) -> tuple[str, dict[str, Judged], tuple[int, int, int]]:
+        judged = self.scorer.judge(pred, true, key)
+        single = sum(len(p[1]) < 2 and p[0] in judged for p in pred)
+        return key, judged, (len(pred), len(true), single)
+
+
+def _notes(pred: Side, truth: Side, s: Settings, classes: list[str]) -> list[str]:
+    """Warnings about two sides by frames; BadInput when they cannot belong together."""
+    for side in (pred, truth):
+        if isinstance(side, FrameSet):
+            check_classes(side, classes, chosen=s.classes is not None)
+    if isinstance(truth, FrameSet):
+        if not truth.frames:
+            raise BadInput(truth.where, "holds no frame")
+        true = [e[0] for elements in truth.frames.values() for e in elements if e[0] in classes]
+        if not true and len(classes) > 1:
+            first = next(iter(truth.frames))
+            names = ", ".join(classes)
+            raise BadInput(truth.where, f"is an empty truth: no {names} in {first} or any other")
+    if isinstance(pred, FrameSet) and not pred.frames:
+        raise BadInput(pred.where, "holds no frame")
+    if not (isinstance(pred, FrameSet) and isinstance(truth, FrameSet)):
+        return []
+    notes = []
+    if not pred.frames.keys() & truth.frames.keys():
+        mine, theirs = next(iter(pred.frames)), next(iter(truth.frames))
+        notes.append(f"no frame has the same name on both sides ({mine}, {theirs}): found by time")
+    lacking = len(truth.frames) - len(pred.frames)
+    if lacking:
+        notes.append(f"{pred.where} lacks {lacking} frames of {truth.where}: they count as empty")
+    return notes
 
 
 def _classes(pred: Side, truth: Side, s: Settings) -> list[str]:
@@ -126,12 +195,11 @@ def _range(pred: Side, truth: Side, s: Settings) -> Range:
     return s.range_m or PROTOCOLS[s.protocol].range_m
 
 
-def _pairs(pred: Side, truth: Side, drives: list[Drive], s: Settings) -> Iterator[Pair]:
+def pairs_of(pred: Side, truth: Side, drives: list[Drive], s: Settings) -> Pairs:
+    """The frames that are compared; UsageError and BadInput as ``compare``."""
     if isinstance(pred, FrameSet) and isinstance(truth, FrameSet):
-        for n, (key, predicted) in enumerate(aligned(pred, truth)):
-            if n % s.every == 0:
-                yield key, predicted, truth.frames[key]
-        return
+        keys = list(truth.frames)[:: s.every]
+        return Pairs(keys, aligned(pred, truth), truth.frames)
     if not drives:
         raise UsageError("a map is compared along a drive: pass its poses with --poses")
     crs = drives[0].crs
@@ -142,22 +210,37 @@ def _pairs(pred: Side, truth: Side, drives: list[Drive], s: Settings) -> Iterato
             region = region_in_range(poses, box)
             poses, box = cells_in(region, s.cell), cell_range(s.cell)
             keys = [f"cell {x:.0f} {y:.0f}" for x, y in poses[:, :2, 3]]
-        left, right = MapSide(in_crs(pred, crs), True), MapSide(in_crs(truth, crs), False)
-        for key, pose in zip(keys, poses, strict=True):
-            yield key, left.crop(pose, box), right.crop(pose, box)
-        return
+        sides = MapSide(in_crs(pred, crs), True), MapSide(in_crs(truth, crs), False)
+        return Pairs(keys, *sides, poses, box)
     if s.cell:
         raise UsageError("--cells compares two maps; one of these is not a map")
-    if isinstance(pred, FrameSet):
-        frames, map_side = pred, MapSide(in_crs(_as_map(truth), crs), False)
-    else:
-        frames, map_side = _as_frames(truth), MapSide(in_crs(pred, crs), True)
+    frames = pred if isinstance(pred, FrameSet) else _as_frames(truth)
     keys = frames.keys()[:: s.every]
-    for key, pose in zip(keys, poses_of_keys(keys, drives, frames.where), strict=True):
-        local = map_side.crop(pose, box)
-        yield (
-            (key, frames.frames[key], local) if frames is pred else (key, local, frames.frames[key])
-        )
+    poses = poses_of_keys(keys, drives, frames.where)
+    if frames is pred:
+        true = MapSide(in_crs(_as_map(truth), crs), False)
+        return Pairs(keys, frames.frames, true, poses, box)
+    return Pairs(keys, MapSide(in_crs(_as_map(pred), crs), True), frames.frames, poses, box)
+
+
+def label_frames(keys: Sequence[str], drives: list[Drive], true_map: VectorMap) -> dict[str, Bools]:
+    """Which scenarios (frames,) hold at each frame; BadInput when a key names no drive or time."""
+    crs = drives[0].crs
+    vector_map = in_crs(true_map, crs)
+    out = {name: np.zeros(len(keys), dtype=bool) for name in SCENARIOS}
+    rows: dict[int, list[int]] = {}
+    times = np.zeros(len(keys), np.int64)
+    for k, key in enumerate(keys):
+        log, time = split_key(key)
+        if time is None:
+            raise BadInput(f"frame {key}", "does not end in a time in nanoseconds")
+        drive = drive_of(drives, log, f"frame {key}")
+        rows.setdefault(next(i for i, d in enumerate(drives) if d is drive), []).append(k)
+        times[k] = time
+    for i, mine in rows.items():
+        for name, mask in scenarios_of(drives[i], vector_map, times[mine]).items():
+            out[name][mine] = mask
+    return out
 
 
 def _as_map(side: Side) -> VectorMap:

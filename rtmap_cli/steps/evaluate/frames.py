@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,11 +61,11 @@ def split_key(key: str) -> tuple[str, int | None]:
     return key, None
 
 
-def aligned(pred: FrameSet, truth: FrameSet) -> Iterator[tuple[str, list[Detection]]]:
-    """The predictions of every frame of the truth, in the truth's order.
+def aligned(pred: FrameSet, truth: FrameSet) -> dict[str, list[Detection]]:
+    """The predictions by the keys of the truth.
 
     Frames are found by key, or by time alone when no key is shared (logs may be named
-    differently). Frames that the prediction lacks count as empty; frames that the truth lacks, or
+    differently). Frames that the prediction lacks are absent; frames that the truth lacks, or
     none in common, are BadInput.
     """
     names = {key: key for key in pred.frames}
@@ -78,9 +77,26 @@ def aligned(pred: FrameSet, truth: FrameSet) -> Iterator[tuple[str, list[Detecti
         shared = len(names) - len(unknown)
         what = f"frame {unknown[0]} is not in {truth.where}"
         raise BadInput(pred.where, what if shared else f"{what}, nor is any other")
-    back = {name: key for key, name in names.items()}
-    for key in truth.frames:
-        yield key, pred.frames[back[key]] if key in back else []
+    return {name: pred.frames[key] for key, name in names.items()}
+
+
+def check_classes(side: FrameSet, judged: list[str], chosen: bool) -> None:
+    """BadInput when a side states or holds other classes than are judged.
+
+    With ``chosen`` classes (--classes) only the ones that a side states not to know are wrong.
+    """
+    todo = "choose common ones with --classes"
+    lacks = [c for c in judged if side.classes is not None and c not in side.classes]
+    if lacks:
+        raise BadInput(side.where, f"does not know the class {lacks[0]}", todo)
+    if chosen:
+        return
+    for key, elements in side.frames.items():
+        for name, _, _ in elements:
+            if name not in judged:
+                names = ", ".join(judged)
+                what = f"frame {key} holds a {name}; the other side has {names}"
+                raise BadInput(side.where, what, todo)
 
 
 def poses_of_keys(keys: list[str], drives: list[Drive], where: str | Path) -> Array:

@@ -65,7 +65,9 @@ class RoadMap:
             apart = (element.xy.max(axis=0) < low) | (element.xy.min(axis=0) > high)
             if element.class_name in lines and not apart.any() and length(element.points) > 0:
                 lines[element.class_name].append(element.xy)
-        thin = [is_ring(p) and 2 * ring_area(p) / length(p) < MEDIAN_WIDTH for p in lines["boundary"]]
+        thin = [
+            is_ring(p) and 2 * ring_area(p) / length(p) < MEDIAN_WIDTH for p in lines["boundary"]
+        ]
         self.sides = [p for p, t in zip(lines["boundary"], thin, strict=True) if not t]
         self.medians = [p for p, t in zip(lines["boundary"], thin, strict=True) if t]
         self.dividers = lines["divider"]
@@ -119,7 +121,12 @@ class RoadMap:
 
     def _samples(self) -> tuple[Array, NDArray[np.int64], Array, Array]:
         """Points (n, 2) on the sides, their line, place along it, and its length if closed."""
-        points, line, along, around = [np.zeros((0, 2))], [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+        points, line, along, around = (
+            [np.zeros((0, 2))],
+            [np.zeros(0)],
+            [np.zeros(0)],
+            [np.zeros(0)],
+        )
         for k, side in enumerate(self.sides):
             closed, total = is_ring(side), length(side)
             p = resample_step(side, SAMPLE)

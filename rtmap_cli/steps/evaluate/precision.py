@@ -8,7 +8,7 @@ paper). All are planar. docs/evaluate.md tells the steps.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.chamfer import bands, beside, chamfer_pairs, sample_lines
+from rtmap_cli.steps.evaluate.shape import MEASURES, Shape, measure
 
 Array = NDArray[np.float64]
 
@@ -78,7 +79,8 @@ class MapScore:
         return [name for name, c in self.classes.items() if not c.num_gt]
 
     def as_json(self) -> dict[str, Any]:
-        """``{"protocol", "mAP", "classes": {name: {"ap", "tp", "num_gt", "num_pred"}}}``."""
+        """``{"protocol", "frames", "mAP", "classes": {name: {"ap", "tp", "num_gt", "num_pred"}}}``
+        and, where there are such classes, ``without_truth``."""
         classes = {
             name: {
                 "ap": {str(t): v for t, v in c.ap.items()},
@@ -88,7 +90,9 @@ class MapScore:
             }
             for name, c in self.classes.items()
         }
-        return {"protocol": self.protocol, "mAP": self.mAP, "classes": classes}
+        out = {"protocol": self.protocol, "frames": self.frames, "mAP": self.mAP}
+        flag = {"without_truth": self.without_truth} if self.without_truth else {}
+        return out | {"classes": classes} | flag
 
 
 def evaluate_frames(
@@ -112,35 +116,76 @@ def evaluate_frames(
     return scorer.result()
 
 
-@dataclass
-class _Ranking:
-    """Scores and hits (one column per threshold) of one class, in input order."""
+@dataclass(frozen=True)
+class Judged:
+    """One frame and class: scores (n,) and hits (n, thresholds) of predictions, the number of true
+    elements, and the sums of ``steps.evaluate.shape`` where they were asked for."""
 
-    num_gt: int = 0
-    scores: list[Array] = field(default_factory=list)
-    hits: list[NDArray[np.bool_]] = field(default_factory=list)
+    scores: Array
+    hits: NDArray[np.bool_]
+    num_gt: int
+    shape: Array | None = None
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """One class over many frames: scores (n,), hits (n, thresholds), the frame (n,) of every
+    prediction in input order, and the number of true elements (frames,)."""
+
+    scores: Array
+    hits: NDArray[np.bool_]
+    frame: NDArray[np.int32]
+    num_gt: NDArray[np.int32]
+
+    def score(self, thresholds: Array, frames: NDArray[np.bool_] | None = None) -> ClassScore:
+        """Rank the predictions of all frames, or of those that a mask (frames,) names."""
+        kept = slice(None) if frames is None else frames[self.frame]
+        scores, hits = self.scores[kept], self.hits[kept]
+        hits = hits[np.argsort(-scores, kind="stable")]
+        num_gt = int((self.num_gt if frames is None else self.num_gt[frames]).sum())
+        names = [float(t) for t in thresholds]
+        return ClassScore(
+            ap={t: average_precision(hits[:, k], num_gt) for k, t in enumerate(names)},
+            tp={t: int(hits[:, k].sum()) for k, t in enumerate(names)},
+            num_gt=num_gt,
+            num_pred=len(scores),
+        )
 
 
 class Scorer:
-    """Collects frames and ranks them at the end; memory grows with predictions, not geometry."""
+    """Judges frames one by one and ranks them at the end.
+
+    Only scores, hits and counts are kept, geometry is forgotten at once. ``judge`` has no memory,
+    so that frames can be judged anywhere. ``shape`` also measures smoothness and topology.
+    """
 
     def __init__(
         self,
         classes: Sequence[str],
         thresholds: Sequence[float] = THRESHOLDS,
         protocol: str = "rtmap",
+        shape: bool = False,
     ) -> None:
         self.protocol = PROTOCOLS[protocol]
+        self.shape = shape
         self.thresholds = np.array(sorted(thresholds), dtype=np.float64)
-        self.rankings = {name: _Ranking() for name in classes}
+        self.classes = list(classes)
+        self.judged: dict[str, list[Judged]] = {name: [] for name in classes}
         self.frames = 0
 
     def add(
         self, pred: Sequence[Detection], truth: Sequence[Detection], name: str | None = None
     ) -> None:
         """Add one frame; ``name`` (default: its number) is used in error messages."""
-        where = f"frame {self.frames if name is None else name}"
-        for class_name, ranking in self.rankings.items():
+        self.collect(self.judge(pred, truth, str(self.frames if name is None else name)))
+
+    def judge(
+        self, pred: Sequence[Detection], truth: Sequence[Detection], name: str
+    ) -> dict[str, Judged]:
+        """Match one frame, class by class."""
+        where = f"frame {name}"
+        out = {}
+        for class_name in self.classes:
             predicted = [p for p in pred if p[0] == class_name]
             if self.protocol.drop_single:
                 predicted = [p for p in predicted if len(p[1]) > 1]
@@ -150,17 +195,51 @@ class Scorer:
                 raise BadInput(where, f"a predicted {class_name} has a score that is not finite")
             lines = self._sampled([p[1] for p in predicted], self.protocol.keep_sampled, where)
             targets = self._sampled([t[1] for t in true], False, where)
-            ranking.num_gt += len(true)
-            ranking.scores.append(scores)
-            ranking.hits.append(self._hits(scores, lines, targets))
+            hits, nearest = self._hits(scores, lines, targets)
+            shape = None
+            if self.shape:
+                matched = np.where(hits[:, -1], nearest, -1)
+                shape = measure([p[1] for p in predicted], [t[1] for t in true], matched)
+            out[class_name] = Judged(scores, hits, len(true), shape)
+        return out
+
+    def collect(self, judged: dict[str, Judged]) -> None:
+        """Add one frame that was judged, here or elsewhere."""
+        for name in self.classes:
+            self.judged[name].append(judged[name])
         self.frames += 1
 
-    def result(self) -> MapScore:
-        """Rank everything added so far."""
+    def rankings(self) -> dict[str, Ranking]:
+        """Everything collected, by class."""
+        out = {}
+        for name, judged in self.judged.items():
+            sizes = [len(j.scores) for j in judged]
+            out[name] = Ranking(
+                np.concatenate([np.zeros(0), *(j.scores for j in judged)]),
+                np.concatenate(
+                    [np.zeros((0, len(self.thresholds)), bool), *(j.hits for j in judged)]
+                ),
+                np.repeat(np.arange(len(judged), dtype=np.int32), sizes),
+                np.array([j.num_gt for j in judged], dtype=np.int32),
+            )
+        return out
+
+    def shapes(self, frames: NDArray[np.bool_] | None = None) -> dict[str, Shape]:
+        """Smoothness and topology by class, over all frames or those of a mask."""
+        out = {}
+        for name, judged in self.judged.items():
+            sums = np.array([np.zeros(MEASURES) if j.shape is None else j.shape for j in judged])
+            out[name] = Shape(
+                sums.reshape(-1, MEASURES)[slice(None) if frames is None else frames].sum(axis=0)
+            )
+        return out
+
+    def result(self, frames: NDArray[np.bool_] | None = None) -> MapScore:
+        """Rank everything added so far, or the frames that a mask (frames,) names."""
         return MapScore(
             self.protocol.name,
-            {name: self._score(ranking) for name, ranking in self.rankings.items()},
-            self.frames,
+            {name: r.score(self.thresholds, frames) for name, r in self.rankings().items()},
+            self.frames if frames is None else int(frames.sum()),
         )
 
     def _sampled(self, lines: list[Array], keep: bool, where: str) -> Array:
@@ -193,11 +272,14 @@ class Scorer:
         out[i[near], j[near]] = found[near]
         return out
 
-    def _hits(self, scores: Array, lines: Array, targets: Array) -> NDArray[np.bool_]:
-        """(n, thresholds): by falling score, each line may take only its nearest true element."""
+    def _hits(
+        self, scores: Array, lines: Array, targets: Array
+    ) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+        """Hits (n, thresholds) and the nearest true element (n,): by falling score, each line may
+        take only that one."""
         hits = np.zeros((len(lines), len(self.thresholds)), dtype=bool)
         if not len(lines) or not len(targets):
-            return hits
+            return hits, np.full(len(lines), -1, np.intp)
         distances = self._distances(lines, targets)
         nearest = distances.argmin(axis=1)
         within = distances[np.arange(len(lines)), nearest][:, None] <= self.thresholds
@@ -205,20 +287,7 @@ class Scorer:
         for k in np.argsort(-scores, kind="stable"):
             hits[k] = within[k] & ~taken[nearest[k]]
             taken[nearest[k]] |= hits[k]
-        return hits
-
-    def _score(self, ranking: _Ranking) -> ClassScore:
-        n = len(self.thresholds)
-        scores = np.concatenate([np.zeros(0), *ranking.scores])
-        hits = np.concatenate([np.zeros((0, n), dtype=bool), *ranking.hits])
-        hits = hits[np.argsort(-scores, kind="stable")]
-        names = [float(t) for t in self.thresholds]
-        return ClassScore(
-            ap={t: average_precision(hits[:, k], ranking.num_gt) for k, t in enumerate(names)},
-            tp={t: int(hits[:, k].sum()) for k, t in enumerate(names)},
-            num_gt=ranking.num_gt,
-            num_pred=len(scores),
-        )
+        return hits, nearest
 
 
 def _bands_touch(

@@ -86,9 +86,10 @@ def _round_islands(path: Trajectory, road: RoadMap) -> Bools:
 def _full_circles(path: Trajectory) -> Bools:
     """Stretches that bend to one side all the time, by most of a circle, on a small radius."""
     out = np.zeros(len(path), dtype=bool)
-    bend = sum(path.bends()) / 2
+    behind, ahead = path.bends()
+    bend = (behind + ahead) / 2
     for sense in (1.0, -1.0):
-        for a, b in _runs(sense * bend >= 1 / (2 * FREE_RADIUS[1])):
+        for a, b in _runs(np.asarray(sense * bend >= 1 / (2 * FREE_RADIUS[1]))):
             change, way = sense * (path.yaw[b - 1] - path.yaw[a]), path.s[b - 1] - path.s[a]
             if change >= FREE_BEND and FREE_RADIUS[0] <= max(way, STEP) / change <= FREE_RADIUS[1]:
                 out[a:b] = True
