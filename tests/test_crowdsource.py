@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,15 @@ import numpy as np
 import pytest
 from fusion_scene import CRS, ORIGIN, crossing, drive, line, save, shifted, street
 
+from rtmap_cli.geometry.polylines import resample_step
 from rtmap_cli.logs.run import Run
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import fused_runs, history, read_map, write_new_map
 
 Call = Callable[..., Any]
+
+LINES = (7.0, -7.0, 0.0, 3.5)
+"""Where the lines of the street lie."""
 
 
 def _runs(world: VectorMap, folder: Path, seeds: Sequence[int], **how: Any) -> list[Run]:
@@ -226,6 +231,50 @@ def test_the_order_of_the_runs_does_not_matter(rtmap: Call, tmp_path: Path) -> N
     assert set(maps[0]) == set(maps[1])
     for name, e in maps[0].items():
         assert np.allclose(e.points[:, :2], maps[1][name].points[:, :2], atol=1e-6)
+
+
+def _noisy(run: Run, seed: int, much: float) -> Run:
+    """The run with a noise of its own on every detection, each stating its own."""
+    rng = np.random.default_rng(seed)
+    o = run.observations
+    size = rng.choice([0.05, much], len(o))[:, None, None]
+    shift = rng.normal(size=(len(o), 1, 2)) * size
+    points = (o.points + shift).astype(np.float32)
+    sigma = np.broadcast_to(size, o.sigma.shape).astype(np.float32)
+    return replace(run, observations=replace(o, points=points, sigma=sigma))
+
+
+def test_sigma_tells_good_detections_from_bad_ones(rtmap: Call, tmp_path: Path) -> None:
+    for k in range(3):
+        run = drive(street(), f"d{k}", seed=k, noise=0.02)
+        save(_noisy(run, k, 1.0), tmp_path / "runs" / run.log_id)
+    errors = {}
+    for name, flags in (("with", []), ("without", ["--without-sigma"])):
+        rtmap("crowdsource", tmp_path / "runs", "--map", tmp_path / name, *flags)
+        fused = read_map(tmp_path / name)
+        lines = [e.xy for e in fused if e.class_name != "ped_crossing"]
+        y = np.concatenate([resample_step(xy, 1.0) for xy in lines])[:, 1] - ORIGIN[1]
+        errors[name] = float(np.median(np.abs(y[:, None] - LINES).min(axis=1)))
+    assert errors["with"] < 0.5 * errors["without"]
+
+
+def test_without_sigma_nothing_of_what_runs_state_counts(rtmap: Call, tmp_path: Path) -> None:
+    for k in range(2):
+        run = drive(street(), f"d{k}", seed=k, noise=0.1)
+        save(run, tmp_path / "plain" / run.log_id)
+        o = run.observations
+        scale = np.random.default_rng(k).uniform(0.2, 5.0, (len(o), 1, 1))
+        wild = replace(o, sigma=(o.sigma * scale).astype(np.float32))
+        save(replace(run, observations=wild), tmp_path / "wild" / run.log_id)
+    maps = []
+    for name in ("plain", "wild"):
+        target = tmp_path / f"map-{name}"
+        rtmap("crowdsource", tmp_path / name, "--map", target, "--without-sigma")
+        maps.append(read_map(target))
+    assert len(maps[0]) == len(maps[1]) >= 6
+    for one, other in zip(*maps, strict=True):
+        assert np.array_equal(one.points, other.points, equal_nan=True)
+        assert np.array_equal(one.covariance, other.covariance, equal_nan=True)
 
 
 def test_what_no_drive_looked_at_stays_as_it_is(rtmap: Call, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from rtmap_cli import options
 if TYPE_CHECKING:
     from rtmap_cli.logs.traversal import Traversal
     from rtmap_cli.maps.element import VectorMap
-    from rtmap_cli.maps.evidence import Settings
     from rtmap_cli.steps.crowdsource.fuse import Fusion
 
 
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 @click.option("--force", is_flag=True, help="Also fuse runs that the map was fused from already.")
 @click.option("--skip-bad-runs", is_flag=True, help="Leave out unreadable runs and name them.")
 @click.option(
-    "--without-sigma", is_flag=True, help="Ablation: all detections weigh the same (no U)."
+    "--without-sigma", is_flag=True, help="Ablation: without U, all detections have the same sigma."
 )
 @options.as_json
 def command(
@@ -51,6 +50,7 @@ def command(
     """
     from rtmap_cli.errors import NoAnswer
     from rtmap_cli.logs.agreement import warning
+    from rtmap_cli.logs.traversal import same_sigma
     from rtmap_cli.maps.store import commit_map, fused_runs, map_exists, read_map, write_new_map
     from rtmap_cli.output import emit, log
 
@@ -58,6 +58,8 @@ def command(
     before = read_map(map_path) if exists else None
     known = fused_runs(map_path) if exists else set()
     paths, traversals, crs, bad = _read(runs_dir, before.crs if before else None, skip_bad_runs)
+    if without_sigma:
+        traversals = [same_sigma(t) for t in traversals]
     for line in bad:
         log(f"left out: {line}")
     done = set() if force else known & {t.run_id for t in traversals}
@@ -77,11 +79,10 @@ def command(
     _tell_unlocalized([t.run_id for t in fresh if not t.localized], exists)
     if before is not None and (doubt := warning(fresh, before, map_path)):
         log(doubt)
-    settings = _settings(without_sigma)
     if before is not None and not force and _rebuildable(map_path, known, traversals):
-        fusion = _rebuilt(traversals, before, crs, paths, settings)
+        fusion = _rebuilt(traversals, before, crs, paths)
     else:
-        fusion = _fuse(traversals, fresh, before, crs, paths, settings, done)
+        fusion = _fuse(traversals, fresh, before, crs, paths, done)
     if not len(fusion.vector_map) and not exists:
         raise NoAnswer(f"{runs_dir}: the runs hold nothing that could become a map")
     if not dry_run:
@@ -122,20 +123,12 @@ def _read(
     return paths, traversals, found, bad
 
 
-def _settings(without_sigma: bool) -> Settings:
-    from rtmap_cli.maps.evidence import Settings
-    from rtmap_cli.maps.refit import FusionModel
-
-    return Settings(fusion=FusionModel(use_sigma=not without_sigma))
-
-
 def _fuse(
     traversals: list[Traversal],
     fresh: list[Traversal],
     before: VectorMap | None,
     crs: str,
     paths: list[Path],
-    settings: Settings,
     done: set[str],
 ) -> Fusion:
     from rtmap_cli.logs.traversal import classes_of
@@ -144,8 +137,8 @@ def _fuse(
     from rtmap_cli.steps.detect_changes.evidence import gather_evidence
 
     prior = before if before is not None else VectorMap((), crs)
-    evidence = gather_evidence(traversals, prior, classes_of(paths), settings, done)
-    return fuse(prior, evidence, fresh, traversals, settings.policy, settings.fusion)
+    evidence = gather_evidence(traversals, prior, classes_of(paths), fused=done)
+    return fuse(prior, evidence, fresh, traversals)
 
 
 def _rebuildable(map_path: Path, known: set[str], traversals: list[Traversal]) -> bool:
@@ -162,13 +155,12 @@ def _rebuilt(
     before: VectorMap,
     crs: str,
     paths: list[Path],
-    settings: Settings,
 ) -> Fusion:
     """All runs fused at once; elements keep their ids."""
     from rtmap_cli.steps.crowdsource.fuse import compared
     from rtmap_cli.steps.crowdsource.identity import keep_ids
 
-    fusion = _fuse(traversals, traversals, None, crs, paths, settings, set())
+    fusion = _fuse(traversals, traversals, None, crs, paths, set())
     return compared(before, keep_ids(before, fusion.vector_map), fusion.waiting)
 
 

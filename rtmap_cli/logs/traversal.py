@@ -7,7 +7,7 @@ the network's error, so that n frames are not n votes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ Int = NDArray[np.int64]
 
 FOUND_SCORE = 0.05
 """Detections below this score carry no information and are not read."""
+SAME_SIGMA = 0.5
+"""Standard deviation (m, each axis) of every vertex of a network that states none."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +182,12 @@ def traversal_of(run: Run, min_score: float = FOUND_SCORE) -> Traversal:
         localized=run.poses is not None,
         model_sha256=run.info.get("model_sha256"),
     )
+
+
+def same_sigma(traversal: Traversal) -> Traversal:
+    """The traversal as a network without U reports it: ``SAME_SIGMA`` for every vertex."""
+    same = np.broadcast_to(np.eye(2) * SAME_SIGMA**2, traversal.covariance.shape)
+    return replace(traversal, covariance=same)
 
 
 def pose_variance(traversal: Traversal, frame: Int, xy: Array, normal: Array) -> Array:

@@ -42,7 +42,6 @@ class FusionModel:
     place_share: float = 0.1
     floor: float = 0.04
     huber: float = 1.5
-    use_sigma: bool = True
 
 
 @dataclass(frozen=True)
@@ -66,8 +65,7 @@ def drive_offsets(
 ) -> DriveOffsets:
     """Mean offset of one drive at every station; ``smooth`` from ``stations.smoother``.
 
-    ``pose_variance`` (k,) belongs to the feet. Detections weigh score / variance (or score alone
-    without ``use_sigma``).
+    ``pose_variance`` (k,) belongs to the feet. Detections weigh score / variance.
     """
     n = len(stations)
     nothing = np.full(n, np.nan)
@@ -76,8 +74,7 @@ def drive_offsets(
     normal = stations.normal[feet.station]
     variance = np.einsum("ni,nij,nj->n", normal, samples.covariance[feet.sample], normal)
     variance = np.maximum(variance, 1e-4)
-    used = variance if model.use_sigma else np.ones(len(variance))
-    weight = samples.spacing[feet.sample] * np.maximum(samples.score[feet.sample], 0.02) / used
+    weight = samples.spacing[feet.sample] * np.maximum(samples.score[feet.sample], 0.02) / variance
 
     def total(values: Array) -> Array:
         out: Array = smooth @ np.bincount(feet.station, values, n)
@@ -155,8 +152,6 @@ def combine(
     variance = np.where(seen, _drive_variance(drives, share, model), np.inf)
     value = np.where(seen, offset, 0.0)
     weight = 1.0 / variance
-    if not model.use_sigma:
-        weight = np.where(seen, 1.0, 0.0)
     robust = np.ones_like(weight)
     for _ in range(4):
         total = (weight * robust).sum(axis=0)

@@ -25,7 +25,7 @@ def _drive_mean(
     rings: Array, variance: Array, score: Array, reference: Array, model: FusionModel
 ) -> tuple[Array, float]:
     """Mean outline of one drive's detections and the variance per axis of its points."""
-    weight = score / variance if model.use_sigma else score
+    weight = score / variance
     aligned = np.stack([align(r, reference) for r in rings])
     mean = (aligned * weight[:, None, None]).sum(0) / weight.sum()
     effective = weight.sum() ** 2 / (weight**2).sum()
@@ -39,7 +39,7 @@ def _combined(
 ) -> tuple[Array, Array]:
     """Outline over the drives (k, n, 2) with per-point Huber weights, and its variance (n,)."""
     centre = np.median(means, axis=0) if base is None else base
-    weight = 1.0 / variances[:, None] if model.use_sigma else np.ones((len(means), 1))
+    weight = 1.0 / variances[:, None]
     for _ in range(4):
         z = np.hypot(*np.moveaxis(means - centre, -1, 0)) / np.sqrt(2 * variances[:, None])
         w = weight * np.minimum(1.0, model.huber / np.maximum(z, 1e-9))
