@@ -64,6 +64,7 @@ PROTOCOLS = ("rtmap", "maptr", "streammapnet")
     "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes; same answer."
 )
 @options.map_version
+@options.leak_check
 @options.gates
 def command(
     pred: str,
@@ -84,6 +85,9 @@ def command(
     shape: bool,
     jobs: int,
     map_version: int | None,
+    trained_on: tuple[str, ...],
+    fail_on_leak: bool,
+    max_leak: float,
     as_json: bool,
     **gate_options: Any,
 ) -> None:
@@ -99,9 +103,15 @@ def command(
     """
     from rtmap_cli.errors import UsageError
     from rtmap_cli.output import emit, log
-    from rtmap_cli.steps.evaluate.compare import Settings, compare_frames, read_side
+    from rtmap_cli.steps.evaluate.compare import (
+        Settings,
+        compare_frames,
+        range_of,
+        read_side,
+    )
     from rtmap_cli.steps.evaluate.drives import read_drives
     from rtmap_cli.steps.evaluate.gates import parse_gates
+    from rtmap_cli.steps.evaluate.leak import check_leak
     from rtmap_cli.steps.evaluate.report import Wanted, report, scenario_labels
 
     gates = parse_gates(as_json, **gate_options)
@@ -121,6 +131,8 @@ def command(
         jobs=jobs,
     )
     sides = read_side(pred, True, drives, map_version), read_side(truth, False, drives)
+    box = range_of(*sides, settings)
+    leak = check_leak(pred, truth, drives, box, trained_on, fail_on_leak)
     compared = compare_frames(*sides, drives, settings)
     labels = None
     if by:
@@ -129,9 +141,19 @@ def command(
     found = report(compared, Wanted(labels, bootstrap, block, seed, shape))
     for note in found.notes:
         log(f"rtmap: {note}")
-    verdict = gates.verdict("map", found.result, found.figures, found.settings)
+    result, leaked = found.result, leak.findings(max_leak) if leak else []
+    if leak:
+        result["leak"] = leak.as_json()
+    if leak and (trained_on or fail_on_leak or leaked):
+        log(f"rtmap: {leak.sentence()}")
+    stated = {"range_m": {"x": box[::2], "y": box[1::2]}, "every": every, "cells": cells}
+    verdict = gates.verdict(
+        "map", result, found.figures, found.settings | stated, leaked if fail_on_leak else ()
+    )
     emit(verdict.result, as_json, verdict.lines(found.lines()))
     verdict.enforce()
+    if leak and fail_on_leak:
+        leak.require_answer()
 
 
 def parse_thresholds(text: str) -> list[float]:

@@ -188,7 +188,8 @@ def _classes(pred: Side, truth: Side, s: Settings) -> list[str]:
     return list(CLASSES)
 
 
-def _range(pred: Side, truth: Side, s: Settings) -> Range:
+def range_of(pred: Side, truth: Side, s: Settings) -> Range:
+    """The range of an evaluation: as asked for, that of a side, or that of the protocol."""
     for side in (pred, truth):
         if s.range_m is None and isinstance(side, FrameSet) and side.range_m:
             return side.range_m
@@ -203,7 +204,7 @@ def pairs_of(pred: Side, truth: Side, drives: list[Drive], s: Settings) -> Pairs
     if not drives:
         raise UsageError("a map is compared along a drive: pass its poses with --poses")
     crs = drives[0].crs
-    box = _range(pred, truth, s)
+    box = range_of(pred, truth, s)
     if isinstance(pred, VectorMap) and isinstance(truth, VectorMap):
         keys, poses = _places(drives, s)
         if s.cell:

@@ -34,7 +34,7 @@ class Area:
 
     poses: Array
     crs: str
-    range_m: Range = DEFAULT_RANGE
+    range_m: Range
 
 
 @dataclass(frozen=True)
@@ -154,6 +154,7 @@ def check_leak(
     pred: str | Path,
     truth: str | Path,
     drives: Sequence[Drive],
+    range_m: Range = DEFAULT_RANGE,
     trained_on: Sequence[str] = (),
     needed: bool = False,
 ) -> Leak | None:
@@ -172,7 +173,7 @@ def check_leak(
         raise UsageError("a leak check needs to know what was trained on: pass --trained-on")
     else:
         return None
-    area = _area(pred, truth, drives)
+    area = _area(pred, truth, drives, range_m)
     if area is not None:
         return find_leak(name, footprint, area)
     if trained_on or needed:
@@ -186,16 +187,17 @@ def _run_info(path: str | Path) -> dict[str, Any] | None:
     return read_run_info(path) if (Path(path) / "run.json").exists() else None
 
 
-def _area(pred: str | Path, truth: str | Path, drives: Sequence[Drive]) -> Area | None:
+def _area(
+    pred: str | Path, truth: str | Path, drives: Sequence[Drive], range_m: Range
+) -> Area | None:
     """The frames of a run (its initial poses are near enough), else those of the drives."""
     from rtmap_cli.logs.run import read_frames
 
     for path in (pred, truth):
         info = _run_info(path)
         if info is not None:
-            x, y = info["range_m"]["x"], info["range_m"]["y"]
             poses = read_frames(Path(path)).initial
-            return Area(poses, str(info["crs"]), (x[0], y[0], x[1], y[1])) if len(poses) else None
+            return Area(poses, str(info["crs"]), range_m) if len(poses) else None
     if not drives:
         return None
-    return Area(np.concatenate([d.pose for d in drives]), drives[0].crs)
+    return Area(np.concatenate([d.pose for d in drives]), drives[0].crs, range_m)
