@@ -214,6 +214,20 @@ def test_figures_that_come_and_go() -> None:
         baseline.changes(figures, Drops(0.0, {"other": 1.0}))
 
 
+def test_what_should_lie_near_something() -> None:
+    baseline = Baseline(Path("r.json"), {}, {"inside.50": 0.45, "nees": 1.4})
+
+    def fell(inside: float, nees: float) -> list[str]:
+        figures = {
+            "inside.50": Figure(inside, "neither", target=0.5),
+            "nees": Figure(nees, "neither", target=1.0),
+        }
+        return [c.name for c in baseline.changes(figures, Drops(0.01)) if c.fell]
+
+    assert fell(0.55, 0.6) == [] and fell(0.5, 1.0) == []
+    assert fell(0.6, 1.4) == ["inside.50"] and fell(0.3, 0.5) == ["inside.50", "nees"]
+
+
 def test_options_that_go_together(rtmap: Any, frames: Write) -> None:
     call = ("evaluate", "map", frames("p", 0.3), "--truth", frames("t", 0.0))
     assert "--baseline" in rtmap(*call, "--max-drop", "0.1", code=2).err

@@ -63,13 +63,18 @@ def command(
     if len(changes) == 1 and not changes[0].is_dir() and "scenes" in (read_json(changes[0]) or ()):
         result = judge_scenes(changes[0], truth)
         lines = _frame_lines({"frame_level": result})
-        settings = {"protocol": result["protocol"]}
+        settings = {"protocol": result["protocol"], "frames": result["frames"]}
     else:
         drives = read_drives(poses, traversal) if poses else []
         sight = sight_of(poses) if poses else None
         result = judge_changes(changes, truth, min_probability, drives, km, sight)
         lines = _lines(result)
-        settings = {"min_probability": min_probability, "files": len(changes)}
+        settings = {
+            "min_probability": min_probability,
+            "files": len(changes),
+            "true_changes": result["found"] + result["missed"],
+            "frames": result.get("frame_level", {}).get("frames"),
+        }
     verdict = gates.verdict("changes", result, _figures(result), settings)
     emit(verdict.result, as_json, verdict.lines(lines))
     verdict.enforce()

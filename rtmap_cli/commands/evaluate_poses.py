@@ -54,10 +54,11 @@ def command(
         result = {"cases": cases}
         lines = [line for name, case in cases.items() for line in (name, *_lines(case))]
         figures = {f"{n}.{k}": f for n, case in cases.items() for k, f in _figures(case).items()}
+        frames = sum(case["n"] for case in cases.values())
     else:
         result = judge_poses(read_run(run), truth, traversal, initial).as_json()
-        lines, figures = _lines(result), _figures(result)
-    verdict = gates.verdict("poses", result, figures, {"initial": initial})
+        lines, figures, frames = _lines(result), _figures(result), result["frames"]
+    verdict = gates.verdict("poses", result, figures, {"initial": initial, "frames": frames})
     emit(verdict.result, as_json, verdict.lines(lines))
     verdict.enforce()
 
@@ -74,8 +75,10 @@ def _figures(result: dict[str, Any]) -> dict[str, Figure]:
     if "share_answered" in result:
         out["share_answered"] = Figure(result["share_answered"])
     if told := result.get("consistency"):
-        out["nees"] = Figure(told["nees"], "neither")
-        out |= {f"inside.{k}": Figure(v["all"], "neither") for k, v in told["inside"].items()}
+        out["nees"] = Figure(told["nees"], "neither", target=1.0)
+        for region, shares in told["inside"].items():
+            honest = float(region) / 100
+            out[f"inside.{region}"] = Figure(shares["all"], "neither", target=honest)
     return out
 
 

@@ -109,10 +109,9 @@ class Baseline:
             return Change(name, None, now, None, False)
         if now is None or figure is None:
             return Change(name, before, None, None, True)
-        if figure.better == "neither":
-            return Change(name, before, now, None, False)
-        worse = before - now if figure.better == "higher" else now - before
-        return Change(name, before, now, worse, worse > drops.allowed(name) + ROUNDING)
+        worse = figure.worse(before)
+        fell = worse is not None and worse > drops.allowed(name) + ROUNDING
+        return Change(name, before, now, worse, fell)
 
 
 def _groups(name: str) -> list[str]:

@@ -24,7 +24,6 @@ from rtmap_cli.steps.evaluate.baseline import (
 from rtmap_cli.steps.evaluate.limits import (
     Figures,
     check_directions,
-    check_names,
     parse_limits,
     past_limits,
     show,
@@ -40,11 +39,6 @@ class Gates:
     baseline: Baseline | None
     drops: Drops
     markdown: bool
-
-    def check_names(self, known: Sequence[str]) -> None:
-        """UsageError when a limit names none of ``known``, for commands that know them early."""
-        check_names(self.under, known, "--fail-under")
-        check_names(self.over, known, "--fail-over")
 
     def verdict(
         self,

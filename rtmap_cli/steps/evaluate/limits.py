@@ -7,18 +7,28 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from rtmap_cli.errors import Findings, UsageError
+from rtmap_cli.errors import UsageError
 
 
 @dataclass(frozen=True)
 class Figure:
     """One number of a result: what it is (None where unknown) and which way it gets better.
 
-    ``neither`` is for numbers that should lie near something (a coverage, a χ²).
+    ``neither`` is for numbers that should lie near something (a coverage, a χ²): ``target``, where
+    that can be said.
     """
 
     value: float | None
     better: Literal["higher", "lower", "neither"] = "higher"
+    target: float | None = None
+
+    def worse(self, before: float) -> float | None:
+        """By how much it is worse than ``before`` (negative: better); None where not known."""
+        if self.value is None or (self.better == "neither" and self.target is None):
+            return None
+        if self.target is not None:
+            return abs(self.value - self.target) - abs(before - self.target)
+        return before - self.value if self.better == "higher" else self.value - before
 
 
 Figures = Mapping[str, Figure]
@@ -89,11 +99,3 @@ def past_limits(
 
 def _or_unknown(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.4f}"
-
-
-def check_limits(limits: Mapping[str, float], figures: Mapping[str, float | None]) -> None:
-    """Findings naming every figure below its limit."""
-    check_names(limits, list(figures))
-    low = past_limits(limits, {}, {name: Figure(value) for name, value in figures.items()})
-    if low:
-        raise Findings("; ".join(low))
