@@ -23,6 +23,7 @@ COMMANDS: dict[str, Any] = {
             "map": ("evaluate_map", "Average precision of a run, a map or a results file."),
             "poses": ("evaluate_poses", "Lateral, longitudinal and yaw errors."),
             "changes": ("evaluate_changes", "Found, missed and false changes."),
+            "uncertainty": ("evaluate_uncertainty", "Whether sigmas and probabilities are honest."),
         },
     ),
     "import": (
