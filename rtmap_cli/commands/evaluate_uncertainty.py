@@ -54,6 +54,7 @@ def command(
       rtmap evaluate uncertainty runs/drive-00 --truth town --poses logs/drive-00 --plot trust.png
     """
     from rtmap_cli.errors import UsageError
+    from rtmap_cli.logs.open import folder_of
     from rtmap_cli.output import emit
     from rtmap_cli.steps.evaluate.gates import parse_gates
     from rtmap_cli.steps.evaluate.uncertainty_plot import write_plot
@@ -64,15 +65,14 @@ def command(
     if plot is not None:
         if plot.suffix.lower() != ".png":
             raise UsageError(f"--plot {plot}: the picture is a PNG, name it .png")
-        for path in (pred, truth, poses):
-            if path is not None and Path(path).is_dir():
-                refuse_inside(plot, Path(path))
+        refuse_inside(plot, *(folder_of(path) for path in (pred, truth, poses) if path))
         refuse_existing(plot, overwrite)
     gates = parse_gates(as_json, **gate_options)
     result = _judge(pred, truth, poses, traversal, threshold, map_version)
     if plot is not None:
         write_plot(result, plot)
-    verdict = gates.verdict("uncertainty", result, _figures(result), {"threshold_m": threshold})
+    settings = {"threshold_m": threshold, "sections": sorted(result)}
+    verdict = gates.verdict("uncertainty", result, _figures(result), settings)
     emit(verdict.result, as_json, verdict.lines(_lines(result)))
     verdict.enforce()
 
@@ -134,7 +134,9 @@ def _figures(result: dict[str, Any]) -> dict[str, Figure]:
     regions |= {name: result.get(name, {}).get("all") for name in POSES}
     for name, told in regions.items():
         if told:
-            out |= {f"{name}.{k}": Figure(v, "neither") for k, v in told["coverage"].items()}
+            for region, share in told["coverage"].items():
+                honest = float(region) / 100
+                out[f"{name}.{region}"] = Figure(share, "neither", target=honest)
             out[f"{name}.nll"] = Figure(told["nll"], "lower")
             out[f"{name}.calibration_error"] = Figure(told["calibration_error"], "lower")
     for name in SHARES:

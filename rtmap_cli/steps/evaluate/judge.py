@@ -62,23 +62,22 @@ def judge_poses(
     run: Run, truth: str | Path, traversal: str | None = None, initial: bool = False
 ) -> PoseScore:
     """Errors of a run's poses against POSES; ``initial`` judges T⁰ and its sigmas instead."""
-    p = pose_pairs(run, truth, traversal, initial)
+    drive = drive_of(read_drives(truth, traversal), run.log_id, truth)
+    p = pose_pairs(run, drive, truth, initial)
     squares = chi_squares(p.true, p.estimate, p.covariance)
     whitened = whitened_errors(p.true, p.estimate, p.covariance)
     return PoseScore(pose_errors(p.true, p.estimate), p.status, squares, whitened, p.upright)
 
 
-def pose_pairs(
-    run: Run, truth: str | Path, traversal: str | None = None, initial: bool = False
-) -> PosePairs:
-    """The poses of a run beside those of POSES, by time; ``initial``: T⁰ and its sigmas.
+def pose_pairs(run: Run, drive: Drive, truth: str | Path, initial: bool = False) -> PosePairs:
+    """The poses of a run beside those of its drive, by time; ``initial``: T⁰ and its sigmas.
 
-    BadInput when the run has no poses, a frame has no true one, or the CRS differ.
+    ``truth`` is named in errors. BadInput when the run has no poses, a frame has no true one, or
+    the CRS differ.
     """
     where = run.path or run.log_id
     if run.poses is None and not initial:
         raise BadInput(where, "has no poses yet", "run rtmap localize first, or pass --initial")
-    drive = drive_of(read_drives(truth, traversal), run.log_id, truth)
     true = true_poses_of(run, drive, truth)
     estimate, covariance, status = _estimates(run, initial)
     upright = upright_errors(true, estimate)

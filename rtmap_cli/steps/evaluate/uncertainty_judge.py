@@ -61,7 +61,7 @@ def judge_run(
     if truth is not None:
         check_shares(run)
         out = _run_elements(run, in_crs(truth, run.crs), true, threshold)
-    return out | _run_poses(run, poses, traversal, true)
+    return out | _run_poses(run, drive, poses, true)
 
 
 def check_shares(run: Run) -> None:
@@ -148,15 +148,13 @@ def share_section(shares: Array, true: NDArray[np.bool_], names: NDArray[Any]) -
     return share_figures(shares, true) | {"by_class": by_class}
 
 
-def _run_poses(
-    run: Run, poses: str | Path, traversal: str | None, true: Array
-) -> dict[str, dict[str, Any]]:
+def _run_poses(run: Run, drive: Drive, poses: str | Path, true: Array) -> dict[str, dict[str, Any]]:
     """Localized poses, the initial ones and those of the network (T^E), where there are any."""
     out = {}
     if run.poses is not None:
-        p = pose_pairs(run, poses, traversal)
+        p = pose_pairs(run, drive, poses)
         out["poses"] = pose_section(p.true, p.estimate, p.covariance, p.status != "no-match")
-    p = pose_pairs(run, poses, traversal, initial=True)
+    p = pose_pairs(run, drive, poses, initial=True)
     out["initial_poses"] = pose_section(p.true, p.estimate, p.covariance)
     xyyaw = run.frames.end_to_end
     known = np.isfinite(xyyaw).all(axis=1)
