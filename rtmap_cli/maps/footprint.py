@@ -152,7 +152,6 @@ def points_in_range(poses: Array, range_m: Range) -> Array:
 
 def union(footprints: Iterable[Footprint]) -> Footprint:
     """What all of them saw."""
-    out = Footprint()
-    for footprint in footprints:
-        out = out | footprint
-    return out
+    several = list(footprints)
+    origins = frozenset[str]().union(*(f.origins for f in several))
+    return Footprint(origins, frozenset[str]().union(*(f.cells for f in several)))

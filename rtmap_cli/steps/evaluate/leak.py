@@ -66,11 +66,11 @@ class Leak:
     def sentence(self) -> str:
         """One line for people."""
         if self.area is None or self.frames is None:
-            return f"leak: unknown ({self.trained_on} was trained on {self.footprint.text()})"
+            return f"leak: unknown ({self.trained_on}: {self.footprint.text()})"
         least = "" if self.certain else "at least "
         return (
             f"leak: {least}{self.area:.1%} of the test area, {self.frames:.1%} of its frames, lie "
-            f"in what {self.trained_on} was trained on ({self.footprint.text()})"
+            f"where training was ({self.trained_on}: {self.footprint.text()})"
         )
 
     def findings(self, most: float) -> list[str]:
@@ -83,8 +83,8 @@ class Leak:
         """NoAnswer when it cannot be told how much was seen."""
         if not self.certain:
             raise NoAnswer(
-                f"how much of the test area {self.trained_on} saw cannot be told (it was trained "
-                f"on {self.footprint.text()}); say it with --trained-on"
+                f"how much of the test area training saw cannot be told ({self.trained_on}: "
+                f"{self.footprint.text()}); say it with --trained-on"
             )
 
 
