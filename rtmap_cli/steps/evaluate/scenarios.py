@@ -32,7 +32,7 @@ TANGENTIAL = 0.8
 """… across the line to its centre (sine of the angle to it) …"""
 RING_BEND = np.radians(30.0)
 """… and turns by this the way it goes round."""
-FREE_BEND, FREE_RADIUS = np.radians(270.0), (5.0, 40.0)
+FREE_BEND, FREE_RADIUS = np.radians(225.0), (5.0, 40.0)
 """Without an island: bent to one side by this, with a mean radius (m) between these."""
 
 

@@ -24,10 +24,11 @@ LEAST_SHARE = 1 / 3
 """Each half of the window bends at least this share of the mean: a turn ahead is not yet one."""
 CLOSED = 5.0
 """A path closes where it comes back to within this distance (m) …"""
-LOOP_LENGTH = (60.0, 1000.0)
+LOOP_LENGTH = (80.0, 1000.0)
 """… after a way of this length (m) …"""
-LOOP_ROUNDNESS = 0.2
-"""… round an area A with 4πA/L² at least this (circle 1, there and back 0)."""
+LOOP_ROUNDNESS = 0.4
+"""… round an area A with 4πA/L² at least this (circle 1; a street and its other
+side 5 m beside it at most 0.39)."""
 
 
 @dataclass(frozen=True)
