@@ -14,17 +14,29 @@ torch = pytest.importorskip("torch", reason="torch is not installed (extra: trai
 pytest.importorskip("onnxscript", reason="onnxscript is not installed (extra: train)")
 pytest.importorskip("cv2", reason="opencv is not installed (extra: train)")
 
-from rtmap_models.training.checkpoint import load_checkpoint  # noqa: E402
+import onnx  # noqa: E402
+from rtmap_models.training.checkpoint import footprint_of_source, load_checkpoint  # noqa: E402
 from training_frames import painted_frames, tiny_config  # noqa: E402
 
+from rtmap_cli.errors import BadInput  # noqa: E402
+from rtmap_cli.formats.model_file import find_model  # noqa: E402
+from rtmap_cli.geometry.poses import se3_from_xyyaw  # noqa: E402
 from rtmap_cli.maps.crs import to_lonlat  # noqa: E402
 from rtmap_cli.maps.element import Element, VectorMap  # noqa: E402
-from rtmap_cli.maps.footprint import Footprint, read_footprint  # noqa: E402
+from rtmap_cli.maps.footprint import (  # noqa: E402
+    METADATA_KEY,
+    NOTHING_KNOWN,
+    TOWNS,
+    Footprint,
+    footprint_of_poses,
+    read_footprint,
+)
 from rtmap_cli.maps.store import write_new_map  # noqa: E402
 
 CRS = "EPSG:32617"
 HERE = to_lonlat(CRS, np.array([[583_000.0, 4_477_000.0]]))
 """Where the log of `write_native_log` begins."""
+HOME = se3_from_xyyaw(583_000.0, 4_477_000.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +98,7 @@ def test_frames_that_cannot_be_believed(rtmap: Any, tiny: Path, tmp_path: Path) 
     assert bad.err.count("\n") == 1
 
 
-def test_a_model_carries_what_its_weights_know(
-    rtmap: Any, step: Any, tiny: Path, tmp_path: Path
-) -> None:
+def test_weights_that_do_not_know(rtmap: Any, step: Any, tiny: Path, tmp_path: Path) -> None:
     frames = painted_frames(tmp_path / "frames", tiny)
     assert step("old", "--data", frames).origins == {"unknown"}
     _, content = load_checkpoint(tmp_path / "old.pt")
@@ -99,17 +109,28 @@ def test_a_model_carries_what_its_weights_know(
     silent = rtmap(*export, "--calibrate", tmp_path / "none", code=3)
     assert "trained on something unknown: say what with --trained-on" in silent.err
     assert "no such model, run, map or log" in rtmap(*export, "--trained-on", "x", code=3).err
-    from rtmap_cli.steps.infer import MapModel
+    hidden = rtmap(*export, "--calibrate", tmp_path / "none", "--no-footprint", code=3)
+    assert "unknown" not in hidden.err
+    rtmap(*export, "--trained-on", "procedural", "--no-footprint", code=2)
 
-    told = ("--trained-on", "procedural", "--trained-on", a_log(tmp_path / "log"))
-    exported = json.loads(rtmap(*export, *told, "--json").out)
-    footprint = MapModel(str(tmp_path / "new.onnx")).info.footprint
-    assert footprint.origins == {"places", "procedural"} and footprint.holds(HERE).all()
-    assert exported["training_footprint"] == footprint.as_json()
-    # Training on from the file, and runs made with it, know it too.
-    towns = note(painted_frames(tmp_path / "towns", tiny), town=3)
-    assert step("on", "--data", towns, "--init", tmp_path / "new.onnx") == footprint
-    log = tmp_path / "log"
-    rtmap("infer", log, "--model", tmp_path / "new.onnx", "-o", tmp_path / "run", "-q")
+
+def test_what_a_model_says_goes_into_its_runs_and_heirs(rtmap: Any, tmp_path: Path) -> None:
+    seen = footprint_of_poses(HOME[None], CRS, (-36, -18, 36, 18)) | TOWNS
+    model, path = onnx.load(find_model("rtmap-tiny")), tmp_path / "model.onnx"
+    kept = [e for e in model.metadata_props if e.key != METADATA_KEY]
+    del model.metadata_props[:]
+    model.metadata_props.extend(kept)
+    onnx.save(model, path)
+    assert footprint_of_source(str(path)) == NOTHING_KNOWN
+    entry = model.metadata_props.add()
+    entry.key, entry.value = METADATA_KEY, json.dumps(seen.as_json())
+    onnx.save(model, path)
+    assert footprint_of_source(str(path)) == seen
+    log = write_native_log(tmp_path / "log", frames=2)
+    rtmap("infer", log, "--model", path, "-o", tmp_path / "run", "-q", "--threads", 1)
     info = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert read_footprint(info["model_footprint"]) == footprint
+    assert read_footprint(info["model_footprint"]) == seen
+    entry.value = "{"
+    onnx.save(model, path)
+    with pytest.raises(BadInput, match="metadata make no sense"):
+        footprint_of_source(str(path))

@@ -60,7 +60,8 @@ def model(weights: Path) -> Path:
     from rtmap_cli.cli import run
 
     path = weights.with_name("model.onnx")
-    assert run(["export-model", str(weights), "-o", str(path), "--name", "test-model"]) == 0
+    command = ["export-model", str(weights), "-o", str(path), "--name", "test-model"]
+    assert run([*command, "--trained-on", "procedural"]) == 0
     return path
 
 
@@ -123,6 +124,9 @@ def test_export_describes_itself(model: Path) -> None:
         assert meta[f"rtmap.{key}"]
     for key in ("image_size", "training_data", "licence", "code_sha"):
         assert meta[f"rtmap.{key}"]
+    assert meta["rtmap.training_data"].startswith("procedural towns: ")
+    footprint = json.loads(meta["rtmap.training_footprint"])
+    assert footprint == {"origins": ["procedural"], "zoom": 18, "cells": {}}
     graph = onnx.load(model)
     assert {node.domain for node in graph.graph.node} == {""}
     raw = model.read_bytes()

@@ -27,6 +27,9 @@ NEEDS = "the export needs the extra 'train': pip install 'rtmap[train]'"
     metavar="WHAT",
     help="Where weights were trained that do not say it: 'procedural', frames, logs or maps.",
 )
+@click.option(
+    "--no-footprint", is_flag=True, help="Leave out where it was trained: the model does not tell."
+)
 @click.option("--licence", default="Apache-2.0", show_default=True, help="For the metadata.")
 @click.option(
     "--calibrate",
@@ -46,6 +49,7 @@ def command(
     name: str | None,
     training_data: str | None,
     trained_on: tuple[str, ...],
+    no_footprint: bool,
     licence: str,
     calibrate: Path | None,
     fp16: bool,
@@ -68,6 +72,8 @@ def command(
     for path in (output, report):
         if path is not None:
             refuse_existing(path, overwrite)
+    if trained_on and no_footprint:
+        raise UsageError("--trained-on says where it was trained, --no-footprint does not")
     if report is not None and report.resolve() == output.resolve():
         raise UsageError("--report and --output are the same file")
     try:
@@ -77,11 +83,14 @@ def command(
         raise UsageError(f"{NEEDS} ({error.name} is missing)") from None
     import json
 
+    from rtmap_cli.maps.footprint import NOTHING_KNOWN
     from rtmap_cli.output import emit, log, plain
 
     network, content = load_network(weights)
-    footprint = _footprint(weights, network, content, trained_on)
-    if not footprint.known:
+    footprint = NOTHING_KNOWN
+    if not no_footprint:
+        footprint = _footprint(weights, network, content, trained_on)
+    if not footprint.known and not no_footprint:
         log(f"rtmap: {weights} was trained on {footprint.text()}: say what with --trained-on")
     factors = _calibrated(network, calibrate)
     metadata = _metadata(content, name, training_data, licence, factors, footprint)
