@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from sample_logs import write_native_log
+from sample_logs import write_av2_log, write_native_log
 
 from rtmap_cli.formats.changes import ChangeEvent, write_change_table
 from rtmap_cli.geometry.poses import se3_from_xyyaw
@@ -222,3 +222,16 @@ def test_visible_to_a_run(rtmap: Any, tmp_path: Path) -> None:
     assert "occluders" in got["frame_level_visible"]["visible"]
     table = ["evaluate", "changes", claims, "--truth", truth, "--poses"]
     assert "is not known" in rtmap(*table, tmp_path / "run" / "poses.parquet").out
+
+
+def test_frames_of_an_argoverse_log_are_not_its_poses(rtmap: Any, tmp_path: Path) -> None:
+    from rtmap_cli.formats.av2.log import Av2Log
+
+    write_av2_log(tmp_path / "log-1")
+    truth = write_truth(tmp_path / "truth.json", {"a": PLACES["a"]})
+    claims = write_claims(tmp_path / "claims.geojson", {})
+    command = ["evaluate", "changes", claims, "--truth", truth, "--poses", tmp_path / "log-1"]
+    got = json.loads(rtmap(*command, "--json").out)
+    log = Av2Log(tmp_path / "log-1")
+    assert got["frame_level"]["frames"] == len(log) < len(log.pose_times)
+    assert got["frame_level_visible"]["frames"] == len(log)

@@ -329,7 +329,7 @@ def test_covariances_of_a_map(rtmap: Any, scene: Path, tmp_path: Path, factor: f
         assert got["vertices"]["gaussian"]["coverage"][region] == bounds(known, n)
     assert "laplace" not in got["vertices"]
     told = got["existence"]
-    assert told["n"] == 124
+    assert told["n"] == 124 and told["not_stated"] == 0
     by_low = {b["low"]: b for b in told["bins"]}
     assert by_low[0.7]["n"] == 100 and by_low[0.7]["true"] == pytest.approx(0.7)
     assert by_low[0.9]["true"] == 1.0
@@ -362,6 +362,15 @@ def test_crossings_too(rtmap: Any, scene: Path, tmp_path: Path) -> None:
     assert got["vertices"]["gaussian"]["coverage"]["50"] == pytest.approx(0.53, abs=0.06)
     assert got["vertices"]["gaussian"]["coverage"]["90"] == pytest.approx(0.91, abs=0.04)
     assert got["existence"]["base_rate"] == 1.0
+
+
+def test_a_map_that_states_nothing(rtmap: Any, scene: Path, tmp_path: Path) -> None:
+    line = ["evaluate", "uncertainty", scene / "town", "--truth", scene / "town"]
+    got = json.loads(rtmap(*line, "--plot", tmp_path / "empty.png", "--json").out)
+    assert got["vertices"]["n"] == 0 and got["vertices"]["without_sigma"] == 4 * 60
+    assert got["existence"]["n"] == 0 and got["existence"]["not_stated"] == 4
+    assert "240 without a sigma" in rtmap(*line).out and "4 elements" in rtmap(*line).out
+    rtmap(*line, "--fail-over", "vertices.nll=0", code=2)
 
 
 def test_detections_meet_truth_as_in_evaluate_map() -> None:

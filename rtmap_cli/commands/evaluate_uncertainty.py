@@ -175,6 +175,8 @@ def _lines(result: dict[str, Any]) -> list[str]:
     if shares:
         header = ["probabilities", "n", "stated", "true", "ECE", "Brier", "of base rate", "NLL"]
         out += ["", *table(header, shares)]
+    if silent := result.get("existence", {}).get("not_stated"):
+        out.append(f"existence: of {silent} elements the map states none")
     for name in SHARES:
         if result.get(name, {}).get("n"):
             out += ["", *_bins(result[name])]

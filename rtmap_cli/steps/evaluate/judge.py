@@ -200,12 +200,11 @@ def _frame_level(
     drives: Sequence[Drive], true: list[Array], told: list[Array], sight: Sight | None
 ) -> dict[str, Any]:
     """TbV's accuracies over all frames and, with ``sight``, by what was visible."""
-    pose = np.concatenate([d.pose for d in drives])
+    times, pose = _frames_of(drives, sight)
     near = [changed_frames(pose[:, :2, 3], events) for events in (true, told)]
     rule = f"TbV, {{}}, changes nearer than {FRAME_RANGE:g} m"
     out = {"frame_level": {"protocol": rule.format("all frames"), **frame_accuracy(*near)}}
     if sight is not None:
-        times = np.concatenate([d.timestamp_ns for d in drives]).tolist()
         seen = [in_view(times, pose, events, sight) for events in (true, told)]
         out["frame_level_visible"] = {
             "protocol": rule.format("visible only"),
@@ -213,6 +212,15 @@ def _frame_level(
             **frame_accuracy(*seen),
         }
     return out
+
+
+def _frames_of(drives: Sequence[Drive], sight: Sight | None) -> tuple[list[int], Array]:
+    """Times and poses (n, 4, 4) of the frames of drives: of a log its frames, else all poses."""
+    if sight is None or sight.frame_times is None:
+        times = np.concatenate([d.timestamp_ns for d in drives])
+        return times.tolist(), np.concatenate([d.pose for d in drives])
+    pose, known = drives[0].at(sight.frame_times)
+    return sight.frame_times[known].tolist(), pose[known]
 
 
 CUMULATIVE, ALONE = "cumulative", "each run alone"

@@ -27,10 +27,12 @@ STEP = 0.1
 @dataclass(frozen=True)
 class Sight:
     """What a vehicle sees. ``told`` says by which rule; ``sees(time, points)`` which of (n, 2)
-    ego-frame points (m) the frame of that time (ns) has in view, as (n,) mask."""
+    ego-frame points (m) the frame of that time (ns) has in view, as (n,) mask. ``frame_times``
+    (ns) of a log that has more poses than frames."""
 
     told: str
     sees: Callable[[int, Array], Mask]
+    frame_times: NDArray[np.int64] | None = None
 
 
 def in_view(
@@ -76,7 +78,9 @@ def sight_of(spec: str | Path) -> Sight | None:
     log = open_log(spec)
     if log.rig is not None and len(log.rig):
         names = ", ".join(c.name for c in log.rig)
-        return Sight(f"projects into a camera ({names})", _cameras(log.rig, log.ground_z))
+        sees = _cameras(log.rig, log.ground_z)
+        # Argoverse 2 states the pose a hundred times a second.
+        return Sight(f"projects into a camera ({names})", sees, getattr(log, "frame_times", None))
     return _boxes(DEFAULT_RANGE, _log_occluders(log), "log")
 
 

@@ -232,7 +232,7 @@ def judge_map(
     whole = joined(truth)
     vertices, real, pieces = map_vertices(fused, scores, whole, cells, CELL)
     existence = _existence(fused, World(truth), region)
-    if not pieces and not existence["n"]:
+    if not pieces and not existence["n"] + existence["not_stated"]:
         raise NoAnswer("nothing of the map lies in range of the poses")
     section = _vertex_section(vertices, real, pieces)
     section |= {"group": f"cell of {CELL:g} m", "threshold_m": threshold}
@@ -261,11 +261,15 @@ def _existence(fused: VectorMap, world: World, region: Any | None) -> dict[str, 
     if region is not None:
         shapely.prepare(region)
     stated_shares, there, names = [], [], []
+    silent = 0
     for element in fused:
         held = world.holds(element.xy, element.class_name, region)
-        if held is not None:
+        # Even odds without any evidence are what an element has of which nothing is known.
+        if held is not None and not (element.existence or element.in_view or element.traversals):
+            silent += 1
+        elif held is not None:
             stated_shares.append(probability(element))
             there.append(held)
             names.append(element.class_name)
     section = share_section(np.array(stated_shares), np.array(there, bool), np.array(names, object))
-    return section | {"claim": "the element is in the world"}
+    return section | {"claim": "the element is in the world", "not_stated": silent}
