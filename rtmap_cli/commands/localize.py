@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from rtmap_cli import options
+from rtmap_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from rtmap_cli.logs.run import Poses, Run
     from rtmap_cli.maps.element import VectorMap
+    from rtmap_cli.steps.localize.relocate import Reach
 
 
 @click.command("localize")
@@ -27,9 +30,22 @@ if TYPE_CHECKING:
     help="What ties a detection to the map: the run's own matches, geometry, or the pose "
     "that the network gave. auto: matches where the run has any.",
 )
+@click.option(
+    "--search",
+    type=(click.FloatRange(0, 40), click.FloatRange(0, 180)),
+    metavar="METRES DEGREES",
+    help="How far the initial poses may be off: the place is searched for first. By itself where "
+    "they state sigmas above 2 m or 5°.",
+)
 @options.as_json
 def command(
-    run: Path, map_path: Path, map_version: int | None, smooth: bool, method: str, as_json: bool
+    run: Path,
+    map_path: Path,
+    map_version: int | None,
+    smooth: bool,
+    method: str,
+    search: tuple[float, float] | None,
+    as_json: bool,
 ) -> None:
     """Find where each frame of RUN stands on the map, how sure that is, and where it is not.
 
@@ -50,9 +66,10 @@ def command(
     # The CRS first: a box in one CRS cannot ask a map in another.
     check_same_crs(map_crs(map_path), str(read_run_info(run)["crs"]), map_path)
     loaded = read_run(run)
-    box = bounds(loaded) if len(loaded.frames) else None
+    reach = _reach(loaded, search, method)
+    box = bounds(loaded, reach) if len(loaded.frames) else None
     vector_map = read_map(map_path, map_version, box)
-    poses = localize(loaded, vector_map, method, smooth, where=map_path)
+    poses = localize(loaded, vector_map, method, smooth, where=map_path, search=reach)
     replaced = loaded.poses is not None
     write_poses(poses, run, loaded.crs)
     if replaced:
@@ -64,8 +81,22 @@ def command(
         "log_id": loaded.log_id,
         "map_version": vector_map.version,
         "replaced": replaced,
+        "search": reach and {"metres": reach.metres, "degrees": math.degrees(reach.radians)},
     }
     emit(result, as_json, _lines(result))
+
+
+def _reach(run: Run, search: tuple[float, float] | None, method: str) -> Reach | None:
+    """How far to search: as asked for, or as far as the stated sigmas of the initial poses say."""
+    from rtmap_cli.steps.localize.relocate import Reach, needs_search, reach_of
+
+    if search is not None and method == "end-to-end":
+        raise UsageError("--search has no use for --method end-to-end")
+    if search is not None:
+        return Reach(search[0], math.radians(search[1]))
+    if method == "end-to-end" or not len(run.frames) or not needs_search(run.frames.sigma):
+        return None
+    return reach_of(run.frames.sigma)
 
 
 def _doubt(run: Run, poses: Poses, vector_map: VectorMap, where: Path) -> str | None:
@@ -109,10 +140,16 @@ def _summary(poses: Poses) -> dict[str, Any]:
 
 
 def _lines(result: dict[str, Any]) -> list[str]:
+    searched = result["search"]
+    how = (
+        f", searched {searched['metres']:.0f} m and {searched['degrees']:.0f}° around"
+        if searched
+        else ""
+    )
     told = ", ".join(f"{n} {s}" for s, n in result["status"].items() if n)
     sigma = result["median_sigma"]
     return [
-        f"{result['run']}: {result['frames']} frames by {result['method']}: {told}",
+        f"{result['run']}: {result['frames']} frames by {result['method']}{how}: {told}",
         f"stated sigma (median): lateral {sigma['lateral_m']:.3f} m, "
         f"longitudinal {sigma['longitudinal_m']:.3f} m, yaw {sigma['yaw_deg']:.3f}°",
     ]

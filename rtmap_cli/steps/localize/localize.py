@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput, NoAnswer, UsageError
 from rtmap_cli.geometry.poses import xyyaw_of
-from rtmap_cli.logs.run import Poses, Run
+from rtmap_cli.logs.run import Poses, Run, RunFrames
 from rtmap_cli.maps.crs import check_same_crs
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.localize.answer import poses_of
@@ -18,6 +19,7 @@ from rtmap_cli.steps.localize.frames import has_matches, read_detections
 from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
 from rtmap_cli.steps.localize.motion import motion_of
+from rtmap_cli.steps.localize.relocate import Found, Reach, moved, relocate, widened
 from rtmap_cli.steps.localize.single import Solution, solve_single
 from rtmap_cli.steps.localize.smooth import solve_smooth
 
@@ -38,10 +40,13 @@ def localize(
     model: ErrorModel | None = None,
     settings: Settings | None = None,
     where: str | Path = "map",
+    search: Reach | None = None,
 ) -> Poses:
     """Localize every frame of a run on a map (Eq. 4 of the paper; ``smooth``: all frames at once).
 
-    ``method`` is one of METHODS. BadInput when the map has another CRS or lies elsewhere, or when
+    ``method`` is one of METHODS. ``search``: how far the initial poses may be off, where that is
+    more than the solver reaches by itself; their sigmas are then taken as half of it at least.
+    BadInput when the map has another CRS or lies elsewhere, or when
     initial poses or sigmas are unusable; NoAnswer when no frame has an answer.
     """
     settings = settings or Settings()
@@ -52,32 +57,49 @@ def localize(
         return _end_to_end(run, origin, smooth, settings)
     if method == "matches" and not has_matches(run):
         raise UsageError("--method matches: the run has no matched elements; use geometry")
+    if search is not None:
+        run = replace(run, frames=_doubted(run.frames, search))
     matched = method == "matches" or (method == "auto" and has_matches(run))
     seen = read_detections(run, lines, settings, matched)
     if not len(seen.frame):
         raise NoAnswer(f"{run.log_id}: no detection can be compared with the map")
-    start = solve_single(lines, seen, model or ErrorModel(), settings)
+    place: Found | None = None
+    gnss = seen.pose
+    if search is not None:
+        motion = motion_of(run.frames, seen.pose, model or ErrorModel(), settings)
+        place = relocate(lines, seen, motion, search)
+        gnss, seen = seen.pose, moved(seen, place)
+    around = None if place is None else place.pose
+    start = solve_single(lines, seen, model or ErrorModel(), settings, start=around)
     if model is None:
         model = calibrated(lines, seen, start, ErrorModel(), settings)
         # Other sigmas may choose another start; other shares of them only refine it.
         found = start if model.scale == ErrorModel().scale else None
-        start = solve_single(lines, seen, model, settings, found)
+        start = solve_single(lines, seen, model, settings, found, around)
     name = "matches" if matched else "geometry"
     if smooth:
-        motion = motion_of(run.frames, seen.pose, model, settings)
-        start = solve_smooth(lines, seen, motion, start, model, settings)
+        motion = motion_of(run.frames, gnss, model, settings)
+        start = solve_smooth(lines, seen, motion, start, model, settings, around)
         name = "smooth"
+    if place is not None:
+        start = widened(start, place)
     poses = poses_of(run.frames, start, origin, name, model, settings)
     if (poses.status == "no-match").all():
         raise NoAnswer(f"{run.log_id}: nothing in any frame matches the map")
     return poses
 
 
-def bounds(run: Run) -> tuple[float, float, float, float]:
+def bounds(run: Run, search: Reach | None = None) -> tuple[float, float, float, float]:
     """The box of the map frame that can matter to a run (metres)."""
     xy = run.frames.initial[:, :2, 3]
-    low, high = xy.min(axis=0) - MAP_MARGIN_M, xy.max(axis=0) + MAP_MARGIN_M
+    margin = MAP_MARGIN_M + (search.metres if search else 0.0)
+    low, high = xy.min(axis=0) - margin, xy.max(axis=0) + margin
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _doubted(frames: RunFrames, search: Reach) -> RunFrames:
+    least = 0.5 * np.array([search.metres, search.metres, search.radians])
+    return replace(frames, sigma=np.maximum(frames.sigma, least))
 
 
 def _check_frames(run: Run) -> None:

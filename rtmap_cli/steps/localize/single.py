@@ -52,17 +52,20 @@ def solve_single(
     model: ErrorModel,
     settings: Settings,
     before: Solution | None = None,
+    start: Array | None = None,
 ) -> Solution:
     """Every frame on its own; the GNSS prior is the initial pose with its sigma.
 
     ``before``: answers to refine with another model, instead of searching for a start again.
+    ``start`` (T, 3): where to search, if not at the initial poses.
     """
     parts = []
     for first in range(0, len(seen), _BATCH):
         last = min(first + _BATCH, len(seen))
         some = seen.between(first, last)
         if before is None:
-            pose, spread = _best_start(lines, some, model, settings)
+            around = some.pose if start is None else start[first:last]
+            pose, spread = _best_start(lines, some, around, model, settings)
         else:
             pose, spread = before.pose[first:last], before.spread[first:last]
         parts.append(_refine(lines, some, pose, spread, model, settings))
@@ -71,16 +74,18 @@ def solve_single(
 
 
 def _best_start(
-    lines: MapLines, seen: Detections, model: ErrorModel, settings: Settings
+    lines: MapLines, seen: Detections, around: Array, model: ErrorModel, settings: Settings
 ) -> tuple[Array, Array]:
     """Pose (T, 3) of the start with the most evidence, and (T, 3, 3) the spread of its rivals.
+
+    Starts lie to either side of ``around`` (T, 3).
 
     All starts take the first rounds with every second vertex; the best ``finalists`` that went
     different ways take the others with all.
     """
     t, starts = len(seen), len(settings.starts_m)
     many = seen.repeated(starts, every=2)
-    pose = many.pose.copy()
+    pose = np.tile(around, (starts, 1))
     shift = np.repeat(settings.starts_m, t)
     pose[:, 0] -= np.sin(pose[:, 2]) * shift
     pose[:, 1] += np.cos(pose[:, 2]) * shift

@@ -35,8 +35,10 @@ def solve_smooth(
     start: Solution,
     model: ErrorModel,
     settings: Settings,
+    first: Array | None = None,
 ) -> Solution:
-    """Gauss–Newton over all frames; ``start`` are the single-frame answers.
+    """Gauss–Newton over all frames; ``start`` are the single-frame answers, ``first`` (T, 3) poses
+    to begin from that are nearer than GNSS.
 
     What stays at the place for the whole drive is the field, and is solved for; lines are looked
     for where the vertices are without it. Other errors that several frames share are inflated by
@@ -46,7 +48,7 @@ def solve_smooth(
     from it. An answer to a prior query leans on where the prior was put, in every frame alike,
     and counts once on either side of ``element_length_m``.
     """
-    pose, bias = _start(motion, start)
+    pose, bias = _start(motion, start, first)
     spacing = motion.spacing[seen.frame]
     repeats = np.clip(model.element_length_m / spacing, 1.0, _MOST_REPEATS)
     asked = seen.chain >= 0
@@ -118,13 +120,14 @@ def _pose_blocks(system: BlockSystem, chunk: Index, index: Index) -> Array:
     return out
 
 
-def _start(motion: Motion, single: Solution) -> tuple[Array, Array]:
+def _start(motion: Motion, single: Solution, first: Array | None) -> tuple[Array, Array]:
     """Poses and biases from GNSS, odometry and single-frame answers, with robust weights.
 
     A frame that fell for the next lane disagrees with its neighbours and loses its vote.
     """
     frames = len(motion.gnss)
-    pose, bias = motion.gnss.copy(), np.zeros((frames, 3))
+    pose, bias = (motion.gnss if first is None else first).copy(), np.zeros((frames, 3))
+    pose[:, 2] = np.unwrap(pose[:, 2])
     chunk = np.arange(frames) // _CHUNK_FRAMES
     sizes = [int(n) * STATE for n in np.bincount(chunk)]
     index = STATE * np.arange(frames)
