@@ -22,7 +22,9 @@ Array = NDArray[np.float64]
 STEP = 1.0
 """Lines are taken at points this far apart along them (m): less is noise of surveying."""
 ZIGZAG = np.radians(5.0)
-"""Two turns of at least this, one after the other and to opposite sides, are a zigzag."""
+"""Turns of at least this, one after the other and to opposite sides, are a zigzag …"""
+ZIGZAG_LENGTH = 12.0
+"""… when they are at most this far apart (m)."""
 MEET = 0.5
 """An end meets a line within this distance (m) …"""
 REACH = 1.5
@@ -64,8 +66,10 @@ def turning(line: Array) -> Array:
     ahead, behind = way[1:], way[:-1]
     cross = behind[:, 0] * ahead[:, 1] - behind[:, 1] * ahead[:, 0]
     turn = np.arctan2(cross, (behind * ahead).sum(axis=1))
-    sharp = np.sign(turn) * (np.abs(turn) >= ZIGZAG)
-    return np.array([np.abs(turn).sum(), total, (sharp[1:] * sharp[:-1] < 0).sum()])
+    sharp = np.flatnonzero(np.abs(turn) >= ZIGZAG)
+    back = np.diff(np.sign(turn[sharp])) != 0
+    near = np.diff(sharp) * np.hypot(*way[0]) <= ZIGZAG_LENGTH
+    return np.array([np.abs(turn).sum(), total, (back & near).sum()])
 
 
 def joints(lines: Sequence[Array]) -> tuple[Array, NDArray[np.int64]]:
