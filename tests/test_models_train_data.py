@@ -203,7 +203,7 @@ def test_logs_of_a_folder_with_their_own_maps(rtmap, tiny: Path, tmp_path: Path)
     rtmap(*call, "--threads", 1)
     assert len(list((tmp_path / "cache").iterdir())) == 2
     trained = rtmap(*call, "--threads", 1, "--steps", 1, "--batch", 1, "--device", "cpu")
-    assert "written" in trained.err
+    assert "written" in trained.err and "cells of about 100 m" in trained.err
 
 
 def test_every_scene_of_a_nuscenes_folder(tiny: Path, tmp_path: Path) -> None:
@@ -213,6 +213,8 @@ def test_every_scene_of_a_nuscenes_folder(tiny: Path, tmp_path: Path) -> None:
     made = gather([scenes[0]], config, tmp_path / "cache", spacing_m=0.1)
     assert len(Frames(made, config)) > 1
     assert len(Frames(made, config)[0].scene.classes)
+    footprint = Frames(made, config).footprint()
+    assert footprint.known and footprint.cells
 
 
 def test_what_is_no_data(tmp_path: Path, tiny: Path) -> None:
