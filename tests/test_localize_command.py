@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from localize_scenes import CRS, drive, error_of, observed, run_of, straight_road, town
 
+from rtmap_cli.logs.residuals import RESIDUALS
 from rtmap_cli.logs.run import Run, read_poses, write_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
+from rtmap_cli.tables import read_table
 
 
 def _write(run: Run, folder: Path) -> Path:
@@ -63,6 +65,25 @@ def test_an_older_answer_is_replaced_and_said(rtmap, run_path, map_path) -> None
     smooth = rtmap("localize", run_path, "--map", map_path, "--smooth")
     assert "by smooth: 8 ok" in smooth.out
     assert read_poses(run_path / "poses.parquet").method == "smooth"
+
+
+def test_residuals_tell_why(rtmap, run_path, map_path, truth) -> None:
+    rtmap("localize", run_path, "--map", map_path)
+    assert not (run_path / "residuals.parquet").exists()
+    rtmap("localize", run_path, "--map", map_path, "--residuals")
+    rows = read_table(run_path / "residuals.parquet", RESIDUALS).to_pandas()
+    used = rows[(rows["weight"] > 0) & (rows["inlier"] > 0.5)]
+    count = read_poses(run_path / "poses.parquet").residual_count
+    assert (used.groupby("frame").size().to_numpy() == count).all()
+    near = rows[rows["element_id"].notna()]
+    assert near["across"].abs().median() < 0.1
+    assert np.allclose(np.hypot(near["normal_x"], near["normal_y"]), 1.0)
+    assert set(near["element_id"]) <= {e.element_id for e in town()}
+    kerb = near[near["element_id"] == "boundary-0"]
+    assert (kerb["class_name"] == "boundary").all()
+    straight = kerb[kerb["x"] < 499_990.0]
+    off = straight["y"] - 5_300_000.0 - 5.4 * straight["normal_y"].abs()
+    assert np.allclose(off.abs(), straight["across"].abs(), atol=0.02)
 
 
 def test_degenerate_frames_are_said(rtmap, tmp_path: Path) -> None:

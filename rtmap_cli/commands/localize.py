@@ -12,6 +12,7 @@ from rtmap_cli import options
 from rtmap_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from rtmap_cli.logs.residuals import Residuals
     from rtmap_cli.logs.run import Poses, Run
     from rtmap_cli.maps.element import VectorMap
     from rtmap_cli.steps.localize.relocate import Reach
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     help="How far the initial poses may be off: the place is searched for first. By itself where "
     "they state sigmas above 2 m or 5°.",
 )
+@click.option("--residuals", is_flag=True, help="Also write RUN/residuals.parquet: why.")
 @options.as_json
 def command(
     run: Path,
@@ -45,6 +47,7 @@ def command(
     smooth: bool,
     method: str,
     search: tuple[float, float] | None,
+    residuals: bool,
     as_json: bool,
 ) -> None:
     """Find where each frame of RUN stands on the map, how sure that is, and where it is not.
@@ -57,6 +60,7 @@ def command(
     Example:
       rtmap localize runs/drive-00 --map map --smooth
     """
+    from rtmap_cli.logs.residuals import write_residuals
     from rtmap_cli.logs.run import read_run, read_run_info, write_poses
     from rtmap_cli.maps.crs import check_same_crs
     from rtmap_cli.maps.store import map_crs, read_map
@@ -69,8 +73,16 @@ def command(
     reach = _reach(loaded, search, method)
     box = bounds(loaded, reach) if len(loaded.frames) else None
     vector_map = read_map(map_path, map_version, box)
-    poses = localize(loaded, vector_map, method, smooth, where=map_path, search=reach)
+    if residuals and method == "end-to-end":
+        raise UsageError("--residuals has no use for --method end-to-end")
+    why: list[Residuals] = []
+    explain = why.append if residuals else None
+    poses = localize(
+        loaded, vector_map, method, smooth, where=map_path, search=reach, explain=explain
+    )
     replaced = loaded.poses is not None
+    for rows in why:
+        write_residuals(rows, run, loaded.crs)
     write_poses(poses, run, loaded.crs)
     if replaced:
         log(f"{run / 'poses.parquet'}: replaced")

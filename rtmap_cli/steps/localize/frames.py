@@ -26,7 +26,8 @@ class Detections:
     Per element: ``frame``, ``code`` (E,) frame and class, in this order; ``points``, ``tangent``,
     ``spread`` (E, V, 2): vertices, directions and stated sigmas in the ego frame; ``common``
     (E, 2): rms of its sigmas; ``length`` (E,) metres; ``logit`` (E,): prior log-odds that it is on
-    the map; ``chain`` (E,): the chain of lines that it was matched with, or -1.
+    the map; ``chain`` (E,): the chain of lines that it was matched with, or -1; ``row`` (E,): its
+    row in the observations of the run.
     """
 
     pose: Array
@@ -40,6 +41,7 @@ class Detections:
     length: Array
     logit: Array
     chain: Index
+    row: Index
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -148,4 +150,5 @@ def read_detections(run: Run, lines: MapLines, settings: Settings, matched: bool
         length=np.maximum(steps.sum(axis=1), 0.1),
         logit=np.clip(logit[rows], -3.0, 5.0),
         chain=chain[rows],
+        row=rows,
     )

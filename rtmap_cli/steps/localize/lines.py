@@ -40,7 +40,7 @@ class Match:
 class MapLines:
     """The lines of a map as samples every half metre, in coordinates relative to ``origin``.
 
-    ``xy``, ``tangent`` (S, 2); ``class_code`` (S,) into ``classes``; ``chain`` (S,): pieces of one
+    ``xy``, ``tangent`` (S, 2); ``element_id`` (S,); ``class_code`` (S,) into ``classes``; ``chain`` (S,): pieces of one
     class which share an end are one chain; ``open_end`` (S,): the sample is the end of a line that
     goes on nowhere; ``variance`` (S,): mean variance of the map per axis, NaN where unknown.
     """
@@ -61,6 +61,7 @@ class MapLines:
         sizes = [len(s[0]) for s in sampled]
         element = np.repeat(np.arange(len(elements)), sizes)
         self.class_code = np.array([classes.index(e.class_name) for e in elements])[element]
+        self.element_id = np.array([e.element_id for e in elements], object)[element]
         chains, free = _chains(elements, origin)
         self.chain = chains[element]
         self.chain_of_id = {e.element_id: int(chains[k]) for k, e in enumerate(elements)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +11,13 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput, NoAnswer, UsageError
 from rtmap_cli.geometry.poses import xyyaw_of
+from rtmap_cli.logs.residuals import Residuals
 from rtmap_cli.logs.run import Poses, Run, RunFrames
 from rtmap_cli.maps.crs import check_same_crs
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.localize.answer import poses_of
 from rtmap_cli.steps.localize.calibrate import calibrated
+from rtmap_cli.steps.localize.explain import residuals_at
 from rtmap_cli.steps.localize.frames import has_matches, read_detections
 from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
@@ -41,13 +44,15 @@ def localize(
     settings: Settings | None = None,
     where: str | Path = "map",
     search: Reach | None = None,
+    explain: Callable[[Residuals], None] | None = None,
 ) -> Poses:
     """Localize every frame of a run on a map (Eq. 4 of the paper; ``smooth``: all frames at once).
 
     ``method`` is one of METHODS. ``search``: how far the initial poses may be off, where that is
     more than the solver reaches by itself; their sigmas are then taken as half of it at least.
-    BadInput when the map has another CRS or lies elsewhere, or when
-    initial poses or sigmas are unusable; NoAnswer when no frame has an answer.
+    ``explain`` is called with the residuals at the poses. BadInput when the map has another CRS or
+    lies elsewhere, or when initial poses or sigmas are unusable; NoAnswer when no frame has an
+    answer.
     """
     settings = settings or Settings()
     check_same_crs(vector_map.crs, run.crs, where)
@@ -86,6 +91,8 @@ def localize(
     poses = poses_of(run.frames, start, origin, name, model, settings)
     if (poses.status == "no-match").all():
         raise NoAnswer(f"{run.log_id}: nothing in any frame matches the map")
+    if explain is not None:
+        explain(residuals_at(run, lines, seen, start.pose, model, settings))
     return poses
 
 
