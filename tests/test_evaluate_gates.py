@@ -258,6 +258,7 @@ def test_markdown_can_be_pasted(rtmap: Any, frames: Write, tmp_path: Path) -> No
     text = rtmap("evaluate", "map", good, "--truth", truth, "--markdown").out
     lines = text.splitlines()
     assert lines[0].startswith("**rtmap evaluate map**") and "protocol rtmap" in lines[0]
+    assert "range_m x -36 … 36, y -18 … 18" in lines[0]
     assert lines[1:4] == ["", "| figure | value |", "| --- | ---: |"]
     assert "| mAP | 1.0000 |" in lines and "| AP.divider | 1.0000 |" in lines
     earlier = report(rtmap, tmp_path / "report.json", "map", good, "--truth", truth)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rtmap_cli.errors import BadInput, UsageError
-from rtmap_cli.output import plain
 from rtmap_cli.steps.evaluate.limits import Figures, number, show
 from rtmap_cli.tables import read_json
 
@@ -85,11 +83,11 @@ class Baseline:
     figures: dict[str, float | None]
 
     def check_comparable(self, settings: Mapping[str, Any]) -> None:
-        """BadInput naming the first setting in which the two evaluations differ."""
-        here = json.loads(json.dumps(plain(dict(settings))))
-        for name in [*here, *(k for k in self.settings if k not in here)]:
-            if here.get(name) != self.settings.get(name):
-                then, now = (say_setting(s.get(name)) for s in (self.settings, here))
+        """BadInput naming the first setting (plain values, as JSON has them) in which the two
+        evaluations differ."""
+        for name in [*settings, *(k for k in self.settings if k not in settings)]:
+            if settings.get(name) != self.settings.get(name):
+                then, now = (say_setting(s.get(name)) for s in (self.settings, settings))
                 what = f"is of another evaluation ({name}: {then} there, {now} here)"
                 raise BadInput(self.path, what, "compare what was made alike")
 

@@ -6,13 +6,14 @@ reports to be comparable); the verdict is the same for all of them.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rtmap_cli.errors import Findings, UsageError
-from rtmap_cli.output import table
+from rtmap_cli.output import plain, table
 from rtmap_cli.steps.evaluate.baseline import (
     Baseline,
     Change,
@@ -55,7 +56,7 @@ class Gates:
         for a name that is no figure.
         """
         check_directions(self.under, self.over, figures)
-        stated = {"verb": verb, **settings}
+        stated = json.loads(json.dumps(plain({"verb": verb, **settings})))
         findings = past_limits(self.under, self.over, figures)
         out = dict(result) | {"settings": stated}
         out["figures"] = {name: figure.value for name, figure in figures.items()}
@@ -125,7 +126,7 @@ class Verdict:
     def _markdown(self) -> list[str]:
         settings = dict(self.result["settings"])
         title = f"**rtmap evaluate {settings.pop('verb')}**"
-        said = [f"{k.replace('_', ' ')} {say_setting(v)}" for k, v in settings.items() if v]
+        said = [f"{name} {say_setting(value)}" for name, value in settings.items() if value]
         header, rows = ["figure", "value"], [[n, show(f.value)] for n, f in self.figures.items()]
         if self.changes is not None:
             header, rows = _compared(self.changes)
