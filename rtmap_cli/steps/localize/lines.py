@@ -40,9 +40,10 @@ class Match:
 class MapLines:
     """The lines of a map as samples every half metre, in coordinates relative to ``origin``.
 
-    ``xy``, ``tangent`` (S, 2); ``element_id`` (S,); ``class_code`` (S,) into ``classes``; ``chain`` (S,): pieces of one
-    class which share an end are one chain; ``open_end`` (S,): the sample is the end of a line that
-    goes on nowhere; ``variance`` (S,): mean variance of the map per axis, NaN where unknown.
+    ``xy``, ``tangent`` (S, 2); ``element_id`` (S,); ``class_code`` (S,) into ``classes``;
+    ``chain`` (S,): pieces of one class which share an end are one chain; ``open_end`` (S,): the
+    sample is the end of a line that goes on nowhere; ``variance`` (S,): mean variance of the map
+    per axis, NaN where unknown.
     """
 
     def __init__(
