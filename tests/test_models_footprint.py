@@ -112,6 +112,12 @@ def test_weights_that_do_not_know(rtmap: Any, step: Any, tiny: Path, tmp_path: P
     hidden = rtmap(*export, "--calibrate", tmp_path / "none", "--no-footprint", code=3)
     assert "unknown" not in hidden.err
     rtmap(*export, "--trained-on", "procedural", "--no-footprint", code=2)
+    towns = note(painted_frames(tmp_path / "towns", tiny), town=3)
+    for known in ("procedural", towns, write_native_log(tmp_path / "log", frames=2)):
+        told = rtmap(*export, "--calibrate", tmp_path / "none", "--trained-on", known, code=3)
+        assert "unknown" not in told.err
+    still = rtmap(*export, "--calibrate", tmp_path / "none", "--trained-on", frames, code=3)
+    assert "something unknown" in still.err, "frames that do not know their place tell nothing"
 
 
 def test_what_a_model_says_goes_into_its_runs_and_heirs(rtmap: Any, tmp_path: Path) -> None:
