@@ -12,7 +12,14 @@ import pytest
 import shapely
 
 from rtmap_cli.errors import BadInput, NoAnswer, UsageError
-from rtmap_cli.geometry.chamfer import bands, beside, chamfer, chamfer_pairs, sample_lines
+from rtmap_cli.geometry.chamfer import (
+    bands,
+    beside,
+    chamfer,
+    chamfer_pairs,
+    close_pairs,
+    sample_lines,
+)
 from rtmap_cli.geometry.polylines import resample
 from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.logs.run import (
@@ -153,7 +160,10 @@ def test_lines_beside_each_other_have_bands_that_touch() -> None:
     rng = np.random.default_rng(2)
     a, b = wiggly(rng, 40), wiggly(rng, 40)
     i, j = (k.ravel() for k in np.indices((40, 40)))
-    near = beside(a, b, i, j, 1.9)
+    picks = np.linspace(0, 99, 12).round().astype(int)
+    which, _, feet = close_pairs(a, b, i, j, np.inf, picks)
+    assert len(which) == len(i)
+    near = beside(a[i][:, picks], b[j], feet, 1.9)
     touch = shapely.intersects(bands(a, 2.0)[i], bands(b, 2.0)[j])
     assert touch[near].all() and near.sum() > 300
 

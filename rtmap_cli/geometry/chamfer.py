@@ -35,18 +35,20 @@ def sample_lines(lines: Sequence[Array], count: int) -> Array:
     if not len(lines):
         return np.zeros((0, count, 2))
     points = np.concatenate([line[:, :2] for line in lines]).astype(np.float64)
-    last = np.cumsum([len(line) for line in lines]) - 1
-    first = np.concatenate([[0], last[:-1] + 1])
+    size = np.array([len(line) for line in lines])
+    last = np.cumsum(size) - 1
+    first = last - size + 1
     way = np.diff(points, axis=0, append=points[-1:])
     step = np.hypot(way[:, 0], way[:, 1])
     step[last] = 0.0
-    # Each line's own arc length; sums over all lines only serve to find the segment.
-    s = np.concatenate(
-        [np.cumsum(np.concatenate([[0.0], step[a:b]])) for a, b in _ranges(first, last)]
-    )
+    # Each line's own arc length in a row; sums over all lines only serve to find the segment.
+    line_of = np.repeat(np.arange(len(lines)), size)
+    place = np.arange(len(points)) - first[line_of]
+    rows = np.zeros((len(lines), int(size.max()) + 1))
+    rows[line_of, place + 1] = step
+    s = np.cumsum(rows, axis=1)[line_of, place]
     total = s[last]
     at = np.linspace(0.0, total, count, axis=1)
-    line_of = np.repeat(np.arange(len(lines)), last - first + 1)
     offset = np.concatenate([[0.0], np.cumsum(total + 1.0)[:-1]])
     k = np.searchsorted(s + offset[line_of], at + offset[:, None], side="right") - 1
     k = np.clip(k, first[:, None], np.maximum(last - 1, first)[:, None])
@@ -57,10 +59,6 @@ def sample_lines(lines: Sequence[Array], count: int) -> Array:
     return out
 
 
-def _ranges(first: Index, last: Index) -> list[tuple[int, int]]:
-    return list(zip(first.tolist(), last.tolist(), strict=True))
-
-
 def chamfer_pairs(a: Array, b: Array, i: Index, j: Index, limit: float = np.inf) -> Array:
     """(k,) distances of the pairs (a[i], b[j]); ``a`` (n, s, 2) and ``b`` (m, s, 2).
 
@@ -68,10 +66,32 @@ def chamfer_pairs(a: Array, b: Array, i: Index, j: Index, limit: float = np.inf)
     other's bounding box, which are cheap, already say so.
     """
     out = np.full(len(i), np.inf)
-    for k in np.flatnonzero(_lower_bound(a, b, i, j, limit) <= limit + 1e-9):
-        out[k] = chamfer(a[i[k]], b[j[k]])
-    out[out > limit] = np.inf
+    which, distance, _ = close_pairs(a, b, i, j, limit)
+    out[which] = distance
     return out
+
+
+def close_pairs(
+    a: Array, b: Array, i: Index, j: Index, limit: float, probes: Index | None = None
+) -> tuple[Index, Array, Index]:
+    """The pairs (a[i], b[j]) within ``limit``: which they are (c,), their distances (c,), and for
+    points number ``probes`` (p,) of a[i] the numbers (c, p) of the nearest points of b[j]."""
+    from scipy.spatial.distance import cdist
+
+    picks = np.zeros(0, np.intp) if probes is None else probes
+    which = np.flatnonzero(_lower_bound(a, b, i, j, limit) <= limit + 1e-9)
+    squares = np.empty((a.shape[1], b.shape[1]))
+    to_b, to_a = np.empty((len(which), a.shape[1])), np.empty((len(which), b.shape[1]))
+    feet = np.empty((len(which), len(picks)), np.intp)
+    for n, k in enumerate(which.tolist()):
+        # As ``chamfer``, in the same memory for all pairs.
+        cdist(a[i[k]], b[j[k]], "sqeuclidean", out=squares)
+        squares.min(axis=1, out=to_b[n])
+        squares.min(axis=0, out=to_a[n])
+        squares[picks].argmin(axis=1, out=feet[n])
+    distance = (np.sqrt(to_b).mean(axis=1) + np.sqrt(to_a).mean(axis=1)) / 2
+    kept = distance <= limit
+    return which[kept], distance[kept], feet[kept]
 
 
 def _lower_bound(a: Array, b: Array, i: Index, j: Index, limit: float) -> Array:
@@ -93,32 +113,28 @@ def _lower_bound(a: Array, b: Array, i: Index, j: Index, limit: float) -> Array:
 
 def _box_distance(points: Array, low: Array, high: Array) -> Array:
     gap = np.maximum(np.maximum(low[:, None] - points, points - high[:, None]), 0)
-    return np.hypot(gap[..., 0], gap[..., 1])
+    return np.sqrt(gap[..., 0] ** 2 + gap[..., 1] ** 2)
 
 
-def beside(a: Array, b: Array, i: Index, j: Index, within: float, probes: int = 12) -> Any:
-    """(k,) True where some point of line a[i] surely lies beside line b[j], within a distance.
+def beside(a: Array, b: Array, nearest: Index, within: float) -> NDArray[np.bool_]:
+    """(k,) True where some point of a line surely lies beside another line, within a distance.
 
-    Some of a's points are probed: one that has its foot inside a segment of b lies in b's flat
-    band. False says nothing: a point not probed may. ``a`` (n, s, 2) and ``b`` (m, s, 2).
+    ``a`` (k, p, 2) are points of one line each, ``b`` (k, s, 2) the other lines, ``nearest``
+    (k, p) the points of b nearest to those of a. A point that has its foot inside a segment of b
+    lies in b's flat band. False says nothing: a point that was not asked may lie there.
     """
-    out = np.zeros(len(i), dtype=bool)
-    picks = np.linspace(0, a.shape[1] - 1, probes).round().astype(int)
-    for part in np.array_split(np.arange(len(i)), max(1, len(i) // 1024)):
-        p, q = a[i[part]][:, picks], b[j[part]]
-        gap = p[:, :, None] - q[:, None]
-        near = (gap**2).sum(axis=-1).argmin(axis=-1)
-        near = np.clip(near, 0, q.shape[1] - 2)
-        for before in (0, 1):
-            k = np.maximum(near - before, 0)[..., None]
-            start = np.take_along_axis(q, k, axis=1)
-            way = np.take_along_axis(q, k + 1, axis=1) - start
-            square = (way**2).sum(axis=-1)
-            offset = p - start
-            along = (offset * way).sum(axis=-1)
-            across = np.abs(offset[..., 0] * way[..., 1] - offset[..., 1] * way[..., 0])
-            inside = (along > 0) & (along < square) & (across < within * np.sqrt(square))
-            out[part] |= inside.any(axis=1)
+    out = np.zeros(len(a), dtype=bool)
+    middle = np.minimum(nearest, b.shape[1] - 2)
+    for before in (0, 1):
+        k = np.maximum(middle - before, 0)[..., None]
+        start = np.take_along_axis(b, k, axis=1)
+        way = np.take_along_axis(b, k + 1, axis=1) - start
+        square = (way**2).sum(axis=-1)
+        offset = a - start
+        along = (offset * way).sum(axis=-1)
+        across = np.abs(offset[..., 0] * way[..., 1] - offset[..., 1] * way[..., 0])
+        inside = (along > 0) & (along < square) & (across < within * np.sqrt(square))
+        out |= inside.any(axis=1)
     return out
 
 

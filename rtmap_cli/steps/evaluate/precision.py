@@ -1,48 +1,25 @@
 """Average precision of detected map elements, as the field's own evaluators compute it.
 
-Protocols: ``maptr`` (MapTR, MapTRv2; 100 points, pairs whose 2 m bands touch), ``streammapnet``
-(200 points, every pair) and ``rtmap`` (the algorithm of ``maptr`` at the 72 × 36 m of the RTMap
-paper). All are planar. docs/evaluate.md tells the steps.
+docs/evaluate-map.md tells the steps; ``protocols`` names the evaluators, ``matching`` has what
+happens in a frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.geometry.chamfer import bands, beside, chamfer_pairs, sample_lines
+from rtmap_cli.steps.evaluate.matching import match
+from rtmap_cli.steps.evaluate.protocols import PROTOCOLS, THRESHOLDS, Detection
 from rtmap_cli.steps.evaluate.shape import MEASURES, Shape, measure
 
 Array = NDArray[np.float64]
-
-Detection = tuple[str, Array, float]
-"""Class, vertices (n, 2 or more columns; the first two count) in metres, score."""
-
-THRESHOLDS = (0.5, 1.0, 1.5)
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """How one evaluator compares lines; ``range_m`` is the ego-frame box its numbers refer to."""
-
-    name: str
-    samples: int
-    band: float | None
-    keep_sampled: bool
-    drop_single: bool
-    range_m: tuple[float, float, float, float]
-
-
-PROTOCOLS = {
-    "maptr": Protocol("maptr", 100, 2.0, True, True, (-30.0, -15.0, 30.0, 15.0)),
-    "streammapnet": Protocol("streammapnet", 200, None, False, False, (-30.0, -15.0, 30.0, 15.0)),
-    "rtmap": Protocol("rtmap", 100, 2.0, True, True, (-36.0, -18.0, 36.0, 18.0)),
-}
 
 
 @dataclass(frozen=True)
@@ -184,23 +161,22 @@ class Scorer:
     ) -> dict[str, Judged]:
         """Match one frame, class by class."""
         where = f"frame {name}"
-        out = {}
+        sides: list[list[list[Detection]]] = [[], []]
         for class_name in self.classes:
             predicted = [p for p in pred if p[0] == class_name]
             if self.protocol.drop_single:
                 predicted = [p for p in predicted if len(p[1]) > 1]
-            true = [t for t in truth if t[0] == class_name]
-            scores = np.array([p[2] for p in predicted], dtype=np.float64)
-            if not np.isfinite(scores).all():
+            if not all(isfinite(p[2]) for p in predicted):
                 raise BadInput(where, f"a predicted {class_name} has a score that is not finite")
-            lines = self._sampled([p[1] for p in predicted], self.protocol.keep_sampled, where)
-            targets = self._sampled([t[1] for t in true], False, where)
-            hits, nearest = self._hits(scores, lines, targets)
-            shape = None
-            if self.shape:
-                matched = np.where(hits[:, -1], nearest, -1)
-                shape = measure([p[1] for p in predicted], [t[1] for t in true], matched)
-            out[class_name] = Judged(scores, hits, len(true), shape)
+            sides[0].append(predicted)
+            sides[1].append([t for t in truth if t[0] == class_name])
+        matches = match(sides[0], sides[1], self.thresholds, self.protocol, where)
+        out = {}
+        for k, class_name in enumerate(self.classes):
+            lines, targets = ([np.asarray(e[1]) for e in side[k]] for side in sides)
+            shape = measure(lines, targets, matches[k].taken) if self.shape else None
+            scores = np.array([p[2] for p in sides[0][k]], dtype=np.float64)
+            out[class_name] = Judged(scores, matches[k].hits, len(targets), shape)
         return out
 
     def collect(self, judged: dict[str, Judged]) -> None:
@@ -241,71 +217,6 @@ class Scorer:
             {name: r.score(self.thresholds, frames) for name, r in self.rankings().items()},
             self.frames if frames is None else int(frames.sum()),
         )
-
-    def _sampled(self, lines: list[Array], keep: bool, where: str) -> Array:
-        """(n, samples, 2) points at equal arc length."""
-        count = self.protocol.samples
-        lines = [np.asarray(line, dtype=np.float64) for line in lines]
-        for points in lines:
-            if points.ndim != 2 or len(points) < 2:
-                raise BadInput(
-                    where,
-                    "an element has fewer than 2 vertices",
-                    f"protocol {self.protocol.name} has no rule for it",
-                )
-            if not np.isfinite(points[:, :2]).all():
-                raise BadInput(where, "a vertex is not finite")
-        out = sample_lines(lines, count)
-        for k, points in enumerate(lines):
-            if keep and len(points) == count:
-                out[k] = points[:, :2]
-        return out
-
-    def _distances(self, lines: Array, targets: Array) -> Array:
-        """(n, m) Chamfer distances; infinite where the largest threshold is out of reach."""
-        out = np.full((len(lines), len(targets)), np.inf)
-        i, j = (k.ravel() for k in np.indices(out.shape))
-        found = chamfer_pairs(lines, targets, i, j, float(self.thresholds[-1]))
-        near = np.flatnonzero(np.isfinite(found))
-        if self.protocol.band is not None and len(near):
-            near = near[_bands_touch(lines, targets, i[near], j[near], self.protocol.band)]
-        out[i[near], j[near]] = found[near]
-        return out
-
-    def _hits(
-        self, scores: Array, lines: Array, targets: Array
-    ) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
-        """Hits (n, thresholds) and the nearest true element (n,): by falling score, each line may
-        take only that one."""
-        hits = np.zeros((len(lines), len(self.thresholds)), dtype=bool)
-        if not len(lines) or not len(targets):
-            return hits, np.full(len(lines), -1, np.intp)
-        distances = self._distances(lines, targets)
-        nearest = distances.argmin(axis=1)
-        within = distances[np.arange(len(lines)), nearest][:, None] <= self.thresholds
-        taken = np.zeros((len(targets), len(self.thresholds)), dtype=bool)
-        for k in np.argsort(-scores, kind="stable"):
-            hits[k] = within[k] & ~taken[nearest[k]]
-            taken[nearest[k]] |= hits[k]
-        return hits, nearest
-
-
-def _bands_touch(
-    lines: Array, targets: Array, i: NDArray[np.intp], j: NDArray[np.intp], half_width: float
-) -> NDArray[np.bool_]:
-    """(k,) whether the bands of lines[i] and targets[j] intersect; none of zero length does."""
-    import shapely
-
-    # A point of one line well inside the other's band settles it; buffers cost ten times as much.
-    long = [np.ptp(x, axis=1).max(axis=1) > 0 for x in (lines, targets)]
-    touch = beside(lines, targets, i, j, 0.95 * half_width) & long[0][i] & long[1][j]
-    rest = np.flatnonzero(~touch)
-    if len(rest):
-        left, left_of = np.unique(i[rest], return_inverse=True)
-        right, right_of = np.unique(j[rest], return_inverse=True)
-        a, b = bands(lines[left], half_width), bands(targets[right], half_width)
-        touch[rest] = shapely.intersects(a[left_of], b[right_of])
-    return np.asarray(touch, dtype=bool)
 
 
 def average_precision(hits: NDArray[np.bool_], num_gt: int) -> float:
