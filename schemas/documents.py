@@ -9,6 +9,7 @@ from rtmap_cli.formats.geojson import GEOJSON_SCHEMA, GEOJSON_VERSION
 from rtmap_cli.logs.run import RUN_SCHEMA, RUN_VERSION
 from rtmap_cli.logs.tables import LOG_SCHEMA, LOG_VERSION
 from rtmap_cli.maps.delta import MAP_FORMAT, MAP_VERSION
+from rtmap_cli.maps.footprint import ORIGINS, PREFIX, ZOOM
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -68,8 +69,23 @@ def _run() -> Node:
         "range_m": _object({"x": span, "y": span}, ["x", "y"], "ego-frame range"),
         "ego_frame": _text("x forward, y left, z up, metres"),
     }
+    needed = list(properties)
+    properties["model_footprint"] = _footprint()
     description = "How a run was made; further members say by what (model, options, map_version …)."
-    return _document(RUN_SCHEMA, "RUN/run.json", _object(properties, list(properties), description))
+    return _document(RUN_SCHEMA, "RUN/run.json", _object(properties, needed, description))
+
+
+def _footprint() -> Node:
+    properties = {
+        "origins": {"type": "array", "items": {"enum": list(ORIGINS)}, "description": "of frames"},
+        "zoom": {"const": ZOOM, "description": "web-mercator zoom of the cells"},
+        "cells": {
+            "type": "object",
+            "description": f"the first {PREFIX} digits of quadkeys: the rest of each, by spaces",
+        },
+    }
+    said = "what the training of the model saw (docs/model-contract.md), where infer made the run"
+    return _object(properties, list(properties), said)
 
 
 def _log() -> Node:
