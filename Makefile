@@ -8,7 +8,7 @@ TESTS ?= tests
 comma := ,
 stamp = $(VENV)/.ready-$(subst $(comma),-,$(1))
 
-.PHONY: demo test lint bench schemas clean
+.PHONY: demo test lint bench bench-tables schemas clean
 
 demo: $(call stamp,simulate)
 	$(BIN)/rtmap demo -o demo_out --overwrite
@@ -25,11 +25,14 @@ lint: $(call stamp,$(EXTRAS))
 bench: $(call stamp,$(EXTRAS))
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script --help | head -3; done
 
+bench-tables: $(call stamp,simulate)
+	$(BIN)/python benchmarks/paper_tables.py
+
 schemas: $(call stamp,$(EXTRAS))
 	$(BIN)/python schemas/generate.py
 
 clean:
-	rm -rf $(VENV) build dist demo_out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) build dist demo_out bench_tables .pytest_cache .mypy_cache .ruff_cache
 
 $(VENV)/.ready-%: pyproject.toml
 	@test -n "$(PYTHON)" || { echo "make: no Python >= 3.11 found; set PYTHON=..." >&2; exit 3; }

@@ -14,6 +14,7 @@ goes on where its checkpoint stood. Needs the extras ``train`` and ``simulate``.
 from __future__ import annotations
 
 import argparse
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -83,15 +84,18 @@ def pose_errors(network: Any, frames: Frames, limit: int) -> dict[str, Array]:
     return {name: np.concatenate(parts) for name, parts in errors.items()}
 
 
-def report(name: str, network: Any, frames: Frames, limit: int) -> None:
-    """Print the figures of one variant."""
+def report(name: str, network: Any, frames: Frames, limit: int) -> dict[str, Any]:
+    """Print the figures of one variant; mean and 90th percentile errors by way of the pose."""
     values = validate(network, frames, limit)
     shown = ("mAP", "mAP prior", "mAP unchanged prior", "AUC existence")
     print(f"{name}: " + ", ".join(f"{k} {values[k]:.3f}" for k in shown))
+    out = {}
     for way, error in pose_errors(network, frames, limit).items():
         mean, high = error.mean(axis=0), np.quantile(error, 0.9, axis=0)
         cells = [f"{mean[k]:.3f}/{high[k]:.3f}" for k in (1, 0, 2)]
         print(f"  {way:<16} {'   '.join(cells)}", flush=True)
+        out[way] = [mean.tolist(), high.tolist()]
+    return out
 
 
 def main() -> None:
@@ -105,12 +109,14 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     parser.add_argument("--threads", type=int, default=1, help="processes")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--json", type=Path, help="write the pose errors for paper_tables.py")
     a = parser.parse_args()
     base = load_config(a.config)
     assert isinstance(base, PaperConfig)
     generate(base, a.data / "train", a.frames, 1, a.threads, print)
     generate(base, a.data / "test", a.test_frames, 900, a.threads, print)
     test = Frames(a.data / "test", base)
+    errors = {}
     for name in a.only:
         config = replace(base, **VARIANTS[name])
         path = a.data / f"{name.replace(' ', '-')}.pt"
@@ -124,7 +130,9 @@ def main() -> None:
         )
         train(config, options, device=a.device, workers=a.threads)
         network, _ = load_network(path)
-        report(name, network, test, a.test_frames)
+        errors[name] = report(name, network, test, a.test_frames)
+    if a.json:
+        a.json.write_text(json.dumps(errors, indent=1), encoding="utf-8")
     print("Columns of poses: lateral m, longitudinal m, yaw °; mean / 90 %.\n" + PAPER)
 
 

@@ -64,13 +64,18 @@ def units_of(options: argparse.Namespace) -> list[Unit]:
     names = LOGS if options.data else [f"town-{seed}" for seed in TOWNS]
     names = list(names)[: options.places]
     worlds = [(p, k, w) for w in range(options.worlds) for p in names for k in options.kinds]
+    short = tuple(c for c in options.cycles if c <= 3)
     out = []
     if 1 in options.tables:
-        out += [Unit("mapping", *w, tuple(options.cycles)) for w in worlds]
+        out += [
+            Unit("mapping", *w, tuple(options.cycles) if w[2] < options.long_worlds else short)
+            for w in worlds
+        ]
+    few = [w for w in worlds if w[2] < max(options.worlds // 2, 1)]
     if 2 in options.tables:
-        out += [Unit(what, *w) for what in ("crossings", "changes") for w in worlds]
+        out += [Unit(what, *w) for what in ("crossings", "changes") for w in few]
     if 3 in options.tables:
-        out += [Unit("poses", *w) for w in worlds]
+        out += [Unit("poses", *w) for w in few]
     if 4 in options.tables and not options.run:
         out += [
             Unit("network", f"town-{t}", "straight", 0) for t in NETWORK_TOWNS[: options.places]
@@ -149,7 +154,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--towns", action="store_true", help="simulated towns, not real maps")
     parser.add_argument("--work", type=Path, default=Path("bench_tables"), help="kept figures")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
-    parser.add_argument("--worlds", type=int, default=4, help="worlds per place and scenario")
+    parser.add_argument("--worlds", type=int, default=8, help="worlds per place and scenario")
+    parser.add_argument("--long-worlds", type=int, default=2, help="... with all --cycles")
     parser.add_argument("--places", type=int, default=3)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--cycles", nargs="+", type=int, default=list(CYCLES))
@@ -164,6 +170,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     options.data = None if options.towns or options.data is None else Path(options.data)
     if options.quick:
         options.worlds, options.places, options.cycles = 1, 1, [1, 2, 3]
+    options.cycles = sorted({2, 3, *options.cycles})
     options.work = options.work / ("av2" if options.data else "towns")
     return options
 

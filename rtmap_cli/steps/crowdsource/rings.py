@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.rings import align, close, open_ring, simplified
 from rtmap_cli.logs.traversal import Traversal
-from rtmap_cli.maps.refit import FusionModel
+from rtmap_cli.maps.refit import SHARPNESS, FusionModel
 from rtmap_cli.steps.crowdsource.lines import LONGEST_MOVE, Fused, columns, planar
 
 Array = NDArray[np.float64]
@@ -25,7 +25,7 @@ def _drive_mean(
     rings: Array, variance: Array, score: Array, reference: Array, model: FusionModel
 ) -> tuple[Array, float]:
     """Mean outline of one drive's detections and the variance per axis of its points."""
-    weight = score / variance
+    weight = score / variance**SHARPNESS
     aligned = np.stack([align(r, reference) for r in rings])
     mean = (aligned * weight[:, None, None]).sum(0) / weight.sum()
     effective = weight.sum() ** 2 / (weight**2).sum()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.rings import RING_POINTS, align, inside, open_ring, overlap, polygon
 from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.refit import SHARPNESS
 from rtmap_cli.maps.visibility import Views, views
 from rtmap_cli.steps.detect_changes.votes import (
     DriveCounts,
@@ -129,7 +130,7 @@ def new_rings(prior: Array, drives: Sequence[Rings], least: float = 0.8) -> Arra
         ]
         points, feature, score, variance = (np.concatenate(p) for p in zip(*parts, strict=True))
         if len(points):
-            weight = score / np.maximum(variance, 0.01)
+            weight = score / np.maximum(variance, 0.01) ** SHARPNESS
             found = np.concatenate([found, _means(points, feature, score, weight, least)])
     return found
 
