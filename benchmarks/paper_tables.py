@@ -4,9 +4,10 @@
     python benchmarks/paper_tables.py --quick          one place, one world, three cycles
     python benchmarks/paper_tables.py --tables 1 3     some of the tables
 
-Every world that was measured is kept in the folder --work (default bench_tables): an interrupted
-run goes on, and tables are printed again in no time. Ends with a line PASS or FAIL for each claim;
-exit code 1 when one fails.
+Every world that was measured is kept in the folder --work (default bench_tables), under a digest
+of the code that measured it: an interrupted run goes on, tables are printed again in no time, and
+after a change of the code everything is measured anew. Ends with a line PASS or FAIL for each
+claim; exit code 1 when one fails.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ import paper_worlds
 from paper_places import LOGS, TOWNS, Place, av2_places, town_places
 from paper_print import Claim, claims_of, shown
 
+import rtmap_cli
 from rtmap_cli.steps.simulate.driving.routes import KINDS
 from rtmap_cli.steps.simulate.worlds.changes import parse_spec
 
@@ -71,7 +73,7 @@ def units_of(options: argparse.Namespace) -> list[Unit]:
             Unit("mapping", *w, tuple(options.cycles) if w[2] < options.long_worlds else short)
             for w in worlds
         ]
-    few = [w for w in worlds if w[2] < max(options.worlds // 2, 1)]
+    few = [w for w in worlds if w[2] < max(options.worlds // 4, 1)]
     if 2 in options.tables:
         out += [Unit(what, *w) for what in ("crossings", "changes") for w in few]
     if 3 in options.tables:
@@ -81,6 +83,16 @@ def units_of(options: argparse.Namespace) -> list[Unit]:
             Unit("network", f"town-{t}", "straight", 0) for t in NETWORK_TOWNS[: options.places]
         ]
     return out
+
+
+def code_digest() -> str:
+    """Six digits that are others when the code that measures is another."""
+    here = Path(__file__).resolve().parent
+    package = Path(rtmap_cli.__file__).parent
+    parts = ("geometry", "logs", "maps", "steps")
+    files = [p for part in parts for p in sorted((package / part).rglob("*.py"))]
+    files += [here / "paper_places.py", here / "paper_worlds.py"]
+    return hashlib.sha256(b"".join(p.read_bytes() for p in files)).hexdigest()[:6]
 
 
 @lru_cache
@@ -154,8 +166,13 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--towns", action="store_true", help="simulated towns, not real maps")
     parser.add_argument("--work", type=Path, default=Path("bench_tables"), help="kept figures")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
-    parser.add_argument("--worlds", type=int, default=8, help="worlds per place and scenario")
-    parser.add_argument("--long-worlds", type=int, default=2, help="... with all --cycles")
+    parser.add_argument(
+        "--worlds",
+        type=int,
+        default=8,
+        help="worlds per place and scenario of Tab. 1; a fourth of them for Tab. 2 and 3",
+    )
+    parser.add_argument("--long-worlds", type=int, default=1, help="... with all --cycles")
     parser.add_argument("--places", type=int, default=3)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--cycles", nargs="+", type=int, default=list(CYCLES))
@@ -171,7 +188,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     if options.quick:
         options.worlds, options.places, options.cycles = 1, 1, [1, 2, 3]
     options.cycles = sorted({2, 3, *options.cycles})
-    options.work = options.work / ("av2" if options.data else "towns")
+    options.work = options.work / f"{'av2' if options.data else 'towns'}-{code_digest()}"
     return options
 
 
