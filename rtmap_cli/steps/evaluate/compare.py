@@ -61,10 +61,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was judged: the frames' keys, in order, their scores and what deserves a warning."""
+    """What was judged: the frames' keys, in order, their scores, the box (m) to which maps were
+    cropped (None: nothing was), and what deserves a warning."""
 
     keys: list[str]
     scorer: Scorer
+    box: Range | None = None
     notes: list[str] = field(default_factory=list)
 
 
@@ -117,8 +119,9 @@ def compare_frames(
     """As ``compare``, with everything that is kept of each frame."""
     s = settings or Settings()
     scorer = Scorer(_classes(pred, truth, s), s.thresholds, s.protocol, s.shape)
-    out = Comparison([], scorer, _notes(pred, truth, s, scorer.classes))
+    notes = _notes(pred, truth, s, scorer.classes)
     pairs = pairs_of(pred, truth, drives, s)
+    out = Comparison([], scorer, pairs.box, notes)
     counts = np.zeros(3, np.int64)
     for key, judged, found in judge_all(pairs, _Judge(scorer), s.jobs):
         out.keys.append(key)

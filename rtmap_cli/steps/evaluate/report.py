@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import UsageError
+from rtmap_cli.maps.crop import Range
 from rtmap_cli.maps.element import RING_CLASSES, VectorMap
 from rtmap_cli.output import table
 from rtmap_cli.steps.evaluate.compare import Comparison, Side, label_frames
@@ -48,9 +49,10 @@ class Part:
 
 @dataclass(frozen=True)
 class Report:
-    """One evaluation, ready for printing and for limits."""
+    """One evaluation, ready for printing and for limits; maps were cropped to ``box`` (m)."""
 
     whole: Part
+    box: Range | None
     scenarios: dict[str, Part] | None
     shapes: dict[str, Shape] | None
     notes: list[str]
@@ -64,6 +66,7 @@ class Report:
             "protocol": score.protocol,
             "classes": list(score.classes),
             "thresholds": thresholds[0] if thresholds else [],
+            "range": None if self.box is None else list(self.box),
             "frames": score.frames,
         }
 
@@ -130,6 +133,7 @@ def report(compared: Comparison, wanted: Wanted) -> Report:
         notes.append(f"intervals from {count} blocks of frames say little; see --block")
     return Report(
         whole,
+        compared.box,
         None if labels is None else {name: part(mask) for name, mask in labels.items()},
         scorer.shapes() if wanted.shape else None,
         notes,
