@@ -12,7 +12,7 @@ from rtmap_cli.steps.localize.field import frame_basis
 from rtmap_cli.steps.localize.frames import read_detections
 from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import STATE, Motion, add_motion, motion_of, step_error
+from rtmap_cli.steps.localize.motion import STATE, Motion, motion_of, motion_terms, step_error
 from rtmap_cli.steps.localize.residuals import judge, linearize, noise_of, place_amplitude
 from rtmap_cli.steps.localize.single import _field_gram, _solve
 
@@ -43,9 +43,11 @@ def _solve_ours(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     index = STATE * np.arange(COUNT)
     for _ in range(12):
         system = BlockSystem([int(n) * STATE for n in np.bincount(chunk)])
-        add_motion(system, index, motion, pose, bias)
+        terms = motion_terms(motion, pose, bias)
+        system.add_chain(index, terms.own, terms.below, terms.gradient)
         system.factor()
         step = system.solve().reshape(COUNT, STATE)
+        assert np.allclose(step, terms.solve(), atol=1e-9)
         pose, bias = pose + step[:, :3], bias + step[:, 3:]
     blocks, first = system.marginals(), np.searchsorted(chunk, chunk) * STATE
     at = index - first
@@ -58,7 +60,7 @@ def _sigmas(sigma: np.ndarray):
 
 
 def _motion_graph(motion: Motion):
-    """The factors of `add_motion`, as functions of plain vectors."""
+    """The factors of `motion_terms`, as functions of plain vectors."""
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     eye = np.eye(3)
 

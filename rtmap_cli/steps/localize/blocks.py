@@ -43,6 +43,23 @@ class BlockSystem:
             self.diagonal[first + 1][np.ix_(b, b)] += information[split:, split:]
             self.lower[first][np.ix_(b, a)] += information[split:, :split]
 
+    def add_chain(self, first: Index, own: Array, below: Array, gradient: Array) -> None:
+        """Add n factors in a row, each of k unknowns from ``first`` (n,) on: ``own`` (n, k, k),
+        ``below`` (n, k, k) with the one before (the first is not used), ``gradient`` (n, k)."""
+        index = first[:, None] + np.arange(own.shape[1])
+        self.gradient[index] += gradient
+        chunk = self.chunk_of(first)
+        for b in np.unique(chunk):
+            n = np.flatnonzero(chunk == b)
+            at = index[n] - self.offset[b]
+            self.diagonal[b][at[:, :, None], at[:, None, :]] += own[n]
+            rows, columns = at[1:, :, None], at[:-1, None, :]
+            self.diagonal[b][rows, columns] += below[n[1:]]
+            self.diagonal[b][at[:-1, :, None], at[1:, None, :]] += np.swapaxes(below[n[1:]], -1, -2)
+            if b and n[0] > 0:
+                last = index[n[0] - 1] - self.offset[b - 1]
+                self.lower[b - 1][np.ix_(at[0], last)] += below[n[0]]
+
     def add_prior(self, index: Index, information: Array, pull: Array) -> None:
         """Independent priors: ``information`` (n,), and ``pull`` (n,) distances from their mean."""
         self.gradient[index] += information * pull

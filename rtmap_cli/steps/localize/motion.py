@@ -6,14 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 
 from rtmap_cli.geometry.poses import wrap_angle
 from rtmap_cli.logs.run import RunFrames
-from rtmap_cli.steps.localize.blocks import BlockSystem
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 STATE = 6
 """Unknowns per frame: x, y, yaw and the bias of GNSS in each."""
@@ -96,61 +95,79 @@ def _white(gnss: Array, odometry: Array, known: NDArray[np.bool_], sigma: Array)
     return np.clip(np.broadcast_to(spread, sigma.shape), 0.05 * sigma, 0.95 * sigma)
 
 
-def add_motion(system: BlockSystem, index: Index, motion: Motion, pose: Array, bias: Array) -> None:
-    """Add GNSS, bias and odometry factors; frame t owns unknowns ``index[t]`` and five more."""
-    for t in range(len(pose)):
-        _add_gnss(system, index, motion, pose, bias, t)
-        if t:
-            _add_step(system, index, motion, pose, bias, t)
+@dataclass(frozen=True)
+class MotionTerms:
+    """Normal equations of a drive without a map, `STATE` unknowns a frame: ``own`` (T, 6, 6) of
+    each frame, ``below`` (T, 6, 6) of each with the one before (the first is zero), ``gradient``
+    (T, 6)."""
+
+    own: Array
+    below: Array
+    gradient: Array
+
+    def solve(self) -> Array:
+        """(T, 6) the step to the minimum (a band of twice a frame's unknowns)."""
+        count = len(self.own)
+        band: Array = np.zeros((2 * STATE, count, STATE))
+        for row in range(STATE):
+            for column in range(STATE):
+                if row >= column:
+                    band[row - column, :, column] = self.own[:, row, column]
+                band[STATE + row - column, :-1, column] = self.below[1:, row, column]
+        flat = band.reshape(2 * STATE, -1)
+        step = solveh_banded(flat, -self.gradient.ravel(), lower=True, check_finite=False)
+        return np.asarray(step, np.float64).reshape(count, STATE)
 
 
-def _add_gnss(
-    system: BlockSystem, index: Index, motion: Motion, pose: Array, bias: Array, t: int
-) -> None:
-    """gnss = pose + bias + white; the first bias has the sigma of all."""
-    error = pose[t] + bias[t] - motion.gnss[t]
-    error[2] = wrap_angle(error[2])
-    weight = motion.white[t] ** -2
-    information = np.asarray(np.kron(np.ones((2, 2)), np.diag(weight)), np.float64)
-    gradient = np.tile(weight * error, 2)
-    if t == 0:
-        prior = motion.slow[0] ** -2
-        information[3:, 3:] += np.diag(prior)
-        gradient[3:] += prior * bias[0]
-    system.add(index[t] + np.arange(STATE), information, gradient)
+def motion_terms(motion: Motion, pose: Array, bias: Array) -> MotionTerms:
+    """GNSS, bias and odometry factors at poses and biases (T, 3)."""
+    count = len(pose)
+    own, below = np.zeros((count, STATE, STATE)), np.zeros((count, STATE, STATE))
+    gradient = np.zeros((count, STATE))
+    on, off = (np.einsum("tii->ti", m) for m in (own, below))  # views of the diagonals
+    # gnss = pose + bias + white; the first bias has the sigma of all.
+    error = pose + bias - motion.gnss
+    error[:, 2] = wrap_angle(error[:, 2])
+    weight = motion.white**-2
+    on += np.tile(weight, 2)
+    for both in (own[:, :3, 3:], own[:, 3:, :3]):
+        np.einsum("tii->ti", both)[...] += weight
+    gradient += np.tile(weight * error, 2)
+    prior = motion.slow[0] ** -2
+    on[0, 3:] += prior
+    gradient[0, 3:] += prior * bias[0]
+    # The bias decays towards zero as it walks.
+    keep = motion.keep[1:]
+    weight = 1.0 / ((1.0 - keep * keep) * motion.slow[1:] ** 2)
+    error = weight * (bias[1:] - keep * bias[:-1])
+    on[1:, 3:] += weight
+    on[:-1, 3:] += keep * keep * weight
+    off[1:, 3:] -= keep * weight
+    gradient[1:, 3:] += error
+    gradient[:-1, 3:] -= keep * error
+    # The motion is what odometry says.
+    t = 1 + np.flatnonzero(np.isfinite(motion.odometry[1:]).all(1))
+    error, jacobian = step_error(pose[t - 1], pose[t], motion.odometry[t])
+    weighted = np.swapaxes(jacobian * motion.odometry_sigma[t, :, None] ** -2, -1, -2)
+    square, pull = weighted @ jacobian, (weighted @ error[..., None])[..., 0]
+    own[t - 1, :3, :3] += square[:, :3, :3]
+    own[t, :3, :3] += square[:, 3:, 3:]
+    below[t, :3, :3] += square[:, 3:, :3]
+    gradient[t - 1, :3] += pull[:, :3]
+    gradient[t, :3] += pull[:, 3:]
+    return MotionTerms(own, below, gradient)
 
 
 def step_error(before: Array, after: Array, odometry: Array) -> tuple[Array, Array]:
-    """Error (3,) of an odometry step between two poses and its Jacobian (3, 6) by both."""
-    c, s = np.cos(before[2]), np.sin(before[2])
-    back = np.array([[c, s], [-s, c]])
+    """Errors (..., 3) of odometry steps between poses and their Jacobians (..., 3, 6) by both."""
+    c, s = np.cos(before[..., 2]), np.sin(before[..., 2])
+    back = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
     d = after - before
-    error = np.append(back @ d[:2], d[2]) - odometry
-    error[2] = wrap_angle(error[2])
-    jacobian = np.zeros((3, 6))
-    jacobian[:2, :2], jacobian[:2, 3:5] = -back, back
-    jacobian[:2, 2] = np.array([[-s, c], [-c, -s]]) @ d[:2]
-    jacobian[2, 2], jacobian[2, 5] = -1.0, 1.0
+    moved = (back @ d[..., :2, None])[..., 0]
+    turned = wrap_angle(d[..., 2] - odometry[..., 2])
+    error = np.concatenate([moved - odometry[..., :2], np.expand_dims(turned, -1)], -1)
+    jacobian = np.zeros((*error.shape, 6))
+    jacobian[..., :2, :2], jacobian[..., :2, 3:5] = -back, back
+    jacobian[..., 0, 2], jacobian[..., 1, 2] = moved[..., 1], -moved[..., 0]
+    jacobian[..., 2, 2], jacobian[..., 2, 5] = -1.0, 1.0
     return error, jacobian
-
-
-def _add_step(
-    system: BlockSystem, index: Index, motion: Motion, pose: Array, bias: Array, t: int
-) -> None:
-    """The bias decays towards zero as it walks; the motion is what odometry says."""
-    keep = motion.keep[t]
-    weight = 1.0 / ((1.0 - keep * keep) * motion.slow[t] ** 2)
-    error = bias[t] - keep * bias[t - 1]
-    information, gradient = np.zeros((12, 12)), np.zeros(12)
-    a, b = np.arange(3, 6), np.arange(9, 12)
-    information[a, a], information[b, b] = keep * keep * weight, weight
-    information[a, b] = information[b, a] = -keep * weight
-    gradient[a], gradient[b] = -keep * weight * error, weight * error
-    if np.isfinite(motion.odometry[t]).all():
-        error, jacobian = step_error(pose[t - 1], pose[t], motion.odometry[t])
-        weight = motion.odometry_sigma[t] ** -2
-        rows = np.array([0, 1, 2, 6, 7, 8])
-        information[np.ix_(rows, rows)] += jacobian.T @ (jacobian * weight[:, None])
-        gradient[rows] += jacobian.T @ (weight * error)
-    first, second = index[t - 1] + np.arange(STATE), index[t] + np.arange(STATE)
-    system.add(np.concatenate([first, second]), information, gradient)

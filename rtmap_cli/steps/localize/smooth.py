@@ -10,7 +10,7 @@ from rtmap_cli.steps.localize.blocks import BlockSystem
 from rtmap_cli.steps.localize.frames import Detections
 from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import STATE, Motion, add_motion
+from rtmap_cli.steps.localize.motion import STATE, Motion, motion_terms
 from rtmap_cli.steps.localize.place import PlaceField
 from rtmap_cli.steps.localize.residuals import Noise, judge, linearize, noise_of
 from rtmap_cli.steps.localize.single import Solution
@@ -91,7 +91,8 @@ def _system(
     of the map residuals alone."""
     system = BlockSystem(field.sizes)
     information, chi2 = field.add(system, weight, noise.shared)
-    add_motion(system, field.frame_index, motion, pose, bias)
+    terms = motion_terms(motion, pose, bias)
+    system.add_chain(field.frame_index, terms.own, terms.below, terms.gradient)
     system.factor()
     return system, information, chi2
 
@@ -128,23 +129,17 @@ def _start(motion: Motion, single: Solution, first: Array | None) -> tuple[Array
     frames = len(motion.gnss)
     pose, bias = (motion.gnss if first is None else first).copy(), np.zeros((frames, 3))
     pose[:, 2] = np.unwrap(pose[:, 2])
-    chunk = np.arange(frames) // _CHUNK_FRAMES
-    sizes = [int(n) * STATE for n in np.bincount(chunk)]
-    index = STATE * np.arange(frames)
     information = np.linalg.inv(single.covariance)
     information[single.residuals == 0] = 0.0
     trust = np.ones(frames)
     for _ in range(_START_ROUNDS):
-        system = BlockSystem(sizes)
-        add_motion(system, index, motion, pose, bias)
+        terms = motion_terms(motion, pose, bias)
         d = pose - single.pose
         d[:, 2] = wrap_angle(d[:, 2])
-        pull = (information @ d[..., None])[..., 0]
-        for t in np.flatnonzero(single.residuals > 0):
-            share = _START_SHARE * trust[t]
-            system.add(index[t] + np.arange(3), share * information[t], share * pull[t])
-        system.factor()
-        step = system.solve().reshape(frames, STATE)
+        share = _START_SHARE * trust
+        terms.own[:, :3, :3] += share[:, None, None] * information
+        terms.gradient[:, :3] += share[:, None] * (information @ d[..., None])[..., 0]
+        step = terms.solve()
         pose, bias = pose + step[:, :3], bias + step[:, 3:]
         d = pose - single.pose
         d[:, 2] = wrap_angle(d[:, 2])
