@@ -17,7 +17,7 @@ from rtmap_cli.maps.existence import (
     stretches,
 )
 from rtmap_cli.maps.stations import assign, chains_of, loose_stretches, samples_of, stations_of
-from rtmap_cli.steps.detect_changes.crossings import Rings, features, match
+from rtmap_cli.steps.detect_changes.crossings import Rings, features, match, new_rings
 from rtmap_cli.steps.detect_changes.ridges import join_collinear, ridge_points, trace
 
 MODEL = VoteModel()
@@ -155,3 +155,22 @@ def test_a_sliver_of_a_crossing_is_that_crossing() -> None:
         points, np.ones(n), np.ones(n), np.zeros(n, int), np.ones(n, bool), features(points)
     )
     assert match(rings, places).tolist() == [0, -1, 1]
+
+
+def _seen_at(centres: list[tuple[float, float]]) -> Rings:
+    """Detections of a crossing of 4 by 8 m at some centres."""
+    outline = open_ring(np.array([[-2, -4], [2, -4], [2, 4], [-2, 4], [-2, -4]], float))
+    points = outline + np.array(centres)[:, None]
+    n = len(points)
+    return Rings(
+        points, np.full(n, 0.25), np.full(n, 0.7), np.arange(n), np.zeros(n, bool), features(points)
+    )
+
+
+def test_a_crossing_that_a_drive_saw_a_little_off_is_one_candidate() -> None:
+    one, other = _seen_at([(0.0, 0.0)] * 12), _seen_at([(2.3, -1.3)] * 10)
+    found = new_rings(one.points[:0], [one, other])
+    assert len(found) == 1
+    assert np.hypot(*found[0].mean(axis=0)) < 2.0
+    far = _seen_at([(6.0, 0.0)] * 10)
+    assert len(new_rings(one.points[:0], [one, far])) == 2

@@ -188,11 +188,13 @@ def _mean(rings: Array, weight: Array) -> Array:
 
 
 def _apart(means: Array) -> Array:
-    """Means without those that overlap an earlier (better supported) one by a third."""
-    shapes = [polygon(m) for m in means]
+    """Means without those that overlap an earlier (better supported) one by a third, or lie within
+    ``NEAR`` of it: one crossing that a drive saw a little off must not compete with itself."""
+    shapes, places = [polygon(m) for m in means], features(means)
     keep: list[int] = []
     for k, shape in enumerate(shapes):
-        if all(overlap(shape, shapes[j]) < 0.3 for j in keep):
+        far = all(np.hypot.reduce(places[k] - places[j]) > NEAR for j in keep)
+        if far and all(overlap(shape, shapes[j]) < 0.3 for j in keep):
             keep.append(k)
     return means[keep]
 
