@@ -33,6 +33,9 @@ WRITERS: dict[str, list[str]] = {
 }
 """Arguments with which each verb comes as far as its output."""
 
+PLOTTERS = {"evaluate uncertainty": [NOWHERE, "--poses", NOWHERE, "--plot"]}
+"""Verbs whose only file is a picture that one may ask for; alike, up to the picture's path."""
+
 FILES = ("detect-changes", "export geojson", "map diff", "picture", "train", "export-model")
 
 
@@ -51,7 +54,7 @@ def _leaves(table: dict[str, Any], before: str = "") -> Iterator[tuple[str, clic
 
 def test_the_verbs_that_can_overwrite_are_all_here() -> None:
     can = {n for n, c in _leaves(COMMANDS) if any(p.name == "overwrite" for p in c.params)}
-    assert can == set(WRITERS)
+    assert can == {*WRITERS, *PLOTTERS}
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -85,3 +88,14 @@ def test_second_outputs_are_guarded_alike(rtmap: Callable[..., Any], tmp_path: P
         told = rtmap(*name.split(), *WRITERS[name], "-o", tmp_path / output, *guarded, code=2)
         assert "precious: exists already" in told.err
     assert (tmp_path / "precious").read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize("name", PLOTTERS)
+def test_a_picture_that_exists_is_a_usage_error(
+    rtmap: Callable[..., Any], tmp_path: Path, name: str
+) -> None:
+    picture = tmp_path / "plot.png"
+    picture.write_bytes(b"precious")
+    told = rtmap(*name.split(), *PLOTTERS[name], picture, code=2)
+    assert f"{picture}: exists already; " in told.err and "--overwrite" in told.err
+    assert picture.read_bytes() == b"precious"
