@@ -128,13 +128,13 @@ def measure(
 
 def _best_threshold(scorer: Scorer) -> dict[str, float]:
     """The score at which F1 is highest (all classes together, 1 m), with precision and recall."""
-    rankings = scorer.rankings.values()
-    scores = np.concatenate([s for r in rankings for s in r.scores])
-    hits = np.concatenate([h[:, 1] for r in rankings for h in r.hits])
+    rankings = scorer.rankings().values()
+    scores = np.concatenate([r.scores for r in rankings])
+    hits = np.concatenate([r.hits[:, 1] for r in rankings])
     order = np.argsort(-scores, kind="stable")
     found = np.cumsum(hits[order])
     precision = found / np.arange(1, len(found) + 1)
-    recall = found / max(1, sum(r.num_gt for r in rankings))
+    recall = found / max(1, sum(int(r.num_gt.sum()) for r in rankings))
     f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-9)
     k = int(f1.argmax())
     values = (scores[order][k], f1[k], precision[k], recall[k])
