@@ -78,7 +78,7 @@ def _plain_class(frames: Sequence[Any], name: str, threshold: float) -> float:
     recall = np.cumsum(ranked) / true_count
     precision = np.cumsum(ranked) / np.arange(1, len(ranked) + 1)
     area, last = 0.0, 0.0
-    for k in np.flatnonzero(ranked):
+    for k in np.flatnonzero(ranked).tolist():
         area += (recall[k] - last) * precision[k:].max()
         last = recall[k]
     return float(area)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -231,7 +231,7 @@ def paper_cells(row: Sequence[float] | None) -> str:
     return ", ".join(f"{row[k]:.3f} / {row[k + 1]:.3f}" for k in (0, 2, 4))
 
 
-def pose_table(found: Found, paper: dict[str, tuple[float, ...]]) -> list[str]:
+def pose_table(found: Found, paper: Mapping[str, tuple[float, ...]]) -> list[str]:
     """Mean / 90th percentile errors by way of finding the pose."""
     ways = [k for k, v in found[0][1].items() if isinstance(v, list)]
     rows = [

@@ -176,7 +176,8 @@ def outdated(
         near = common_path(paths)
     except NoAnswer:
         near = paths[0]
-    old, changes = place.world, []
+    old = place.world
+    changes: list[Any] = []
     for spec in specs:
         try:
             old, made = apart(old, spec, rng, near, changes)
