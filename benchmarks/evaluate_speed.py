@@ -31,7 +31,7 @@ from scipy.spatial.distance import cdist
 from rtmap_cli.formats.map_frames import read_map_frames
 from rtmap_cli.geometry.polylines import resample
 from rtmap_cli.output import log, table
-from rtmap_cli.steps.evaluate.precision import THRESHOLDS, Detection, Scorer
+from rtmap_cli.steps.evaluate.maps.precision import THRESHOLDS, Detection, Scorer
 
 CLASSES = ("ped_crossing", "divider", "boundary")
 BAR = 20.0

@@ -33,13 +33,13 @@ from rtmap_cli.logs.run import read_run
 from rtmap_cli.maps.element import CLASSES, VectorMap
 from rtmap_cli.maps.store import read_map
 from rtmap_cli.output import plain, table
-from rtmap_cli.steps.evaluate.compare import Settings, compare
 from rtmap_cli.steps.evaluate.drives import Drive, read_drives
-from rtmap_cli.steps.evaluate.frames import FrameSet, run_frames
 from rtmap_cli.steps.evaluate.judge import judge_changes, judge_poses
+from rtmap_cli.steps.evaluate.maps.compare import Settings, compare
+from rtmap_cli.steps.evaluate.maps.frames import FrameSet, run_frames
+from rtmap_cli.steps.evaluate.maps.precision import PROTOCOLS, MapScore
+from rtmap_cli.steps.evaluate.maps.whole import CELL, coverage, honesty, region_in_range
 from rtmap_cli.steps.evaluate.poses import pool_poses
-from rtmap_cli.steps.evaluate.precision import PROTOCOLS, MapScore
-from rtmap_cli.steps.evaluate.whole import CELL, coverage, honesty, region_in_range
 
 MAPS = ("7fab2350", "adcf7d18", "3bffdcff")
 SCENARIOS = ("straight", "turning")

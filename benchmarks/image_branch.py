@@ -32,7 +32,7 @@ from rtmap_models.training.checkpoint import load_network, start_from
 from rtmap_models.training.recipe import load_recipe
 from rtmap_models.training.train import TrainOptions, train
 
-from rtmap_cli.steps.evaluate.precision import Scorer
+from rtmap_cli.steps.evaluate.maps.precision import Scorer
 
 IMAGES = "rtmap-tiny-images"
 VARIANTS: dict[str, dict[str, Any] | None] = {

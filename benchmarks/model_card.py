@@ -29,7 +29,7 @@ from scipy.stats import spearmanr
 
 from rtmap_cli.geometry.poses import se3_from_xyyaw, xyyaw_of
 from rtmap_cli.maps.prior import on_prior
-from rtmap_cli.steps.evaluate.precision import Scorer
+from rtmap_cli.steps.evaluate.maps.precision import Scorer
 from rtmap_cli.steps.infer.duplicates import fade_duplicates
 from rtmap_cli.steps.infer.model import MapModel
 

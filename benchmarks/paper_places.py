@@ -23,8 +23,8 @@ from rtmap_cli.formats.av2.vector_map import read_av2_archive, vector_map_of
 from rtmap_cli.logs.run import OUTDATED, Run
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import CLASSES, VectorMap
+from rtmap_cli.steps.evaluate.maps.precision import MapScore, Scorer
 from rtmap_cli.steps.evaluate.poses import PoseScore, pool_poses
-from rtmap_cli.steps.evaluate.precision import MapScore, Scorer
 from rtmap_cli.steps.simulate.driving.drive import linked
 from rtmap_cli.steps.simulate.driving.drives import Drive, drive_over_route, with_traffic
 from rtmap_cli.steps.simulate.driving.routes import Lane, corridor, find_routes, lanes_of_av2

@@ -25,7 +25,7 @@ from paper_places import BASELINE, Place, add_frames, av2_places, mean_of, town_
 from paper_worlds import Mapping, map_world
 
 from rtmap_cli.maps.element import CLASSES
-from rtmap_cli.steps.evaluate.precision import Scorer
+from rtmap_cli.steps.evaluate.maps.precision import Scorer
 from rtmap_cli.steps.simulate.driving.routes import KINDS
 from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
 from rtmap_cli.steps.simulate.perceiving.presets import PRESETS, Preset

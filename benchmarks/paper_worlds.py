@@ -32,13 +32,13 @@ from rtmap_cli.logs.run import (
 )
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import read_map, write_new_map
-from rtmap_cli.steps.evaluate.changes import changed_frames
-from rtmap_cli.steps.evaluate.compare import Settings, compare
+from rtmap_cli.steps.evaluate.changes.elements import changed_frames
 from rtmap_cli.steps.evaluate.drives import Drive as TrueDrive
 from rtmap_cli.steps.evaluate.drives import read_drives
 from rtmap_cli.steps.evaluate.judge import judge_poses
+from rtmap_cli.steps.evaluate.maps.compare import Settings, compare
+from rtmap_cli.steps.evaluate.maps.precision import Scorer
 from rtmap_cli.steps.evaluate.poses import pose_errors
-from rtmap_cli.steps.evaluate.precision import Scorer
 from rtmap_cli.steps.simulate.driving.drives import Drive
 from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
 from rtmap_cli.steps.simulate.worlds.changes import (

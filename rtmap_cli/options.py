@@ -74,7 +74,7 @@ lonlat: Decorator = click.option(
 
 
 def gates(command: Callable[..., Any]) -> Callable[..., Any]:
-    """What every ``evaluate`` offers CI; `parse_gates` of ``steps.evaluate.gates`` takes them."""
+    """What every ``evaluate`` offers CI; `parse_gates` (``steps.evaluate.gates``) takes them."""
     decorators: list[Decorator] = [
         click.option(
             "--fail-under",
@@ -106,7 +106,7 @@ def gates(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def leak_check(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Was the test area seen in training? `check_leak` of ``steps.evaluate.leak`` tells."""
+    """Was the test area seen in training? `check_leak` of ``steps.evaluate.gates.leak`` tells."""
     decorators: list[Decorator] = [
         click.option(
             "--trained-on",

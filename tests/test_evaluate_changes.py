@@ -14,8 +14,8 @@ from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.logs.run import true_poses, write_poses
 from rtmap_cli.maps.crs import to_lonlat
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
-from rtmap_cli.steps.evaluate.changes import Change, same_place, score_changes
-from rtmap_cli.steps.evaluate.whole import cells_in, coverage, honesty, region_in_range
+from rtmap_cli.steps.evaluate.changes.elements import Change, same_place, score_changes
+from rtmap_cli.steps.evaluate.maps.whole import cells_in, coverage, honesty, region_in_range
 
 CRS = "EPSG:32632"
 ORIGIN = np.array([500_000.0, 5_000_000.0])
@@ -32,7 +32,7 @@ def test_reference_scenes(rtmap: Any, rtmap_golden: Path) -> None:
     got = json.loads(rtmap("evaluate", "changes", path, "--truth", path, "--json").out)
     assert "all frames" in got["protocol"]
     assert {k: got[k] for k in data["expected"]} == pytest.approx(data["expected"])
-    from rtmap_cli.steps.evaluate.changes import distances_to_events
+    from rtmap_cli.steps.evaluate.changes.elements import distances_to_events
     from rtmap_cli.steps.evaluate.judge import scene_truth
 
     for scene in data["scenes"]:

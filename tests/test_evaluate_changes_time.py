@@ -25,8 +25,8 @@ from rtmap_cli.logs.run import (
 )
 from rtmap_cli.maps.crs import to_lonlat
 from rtmap_cli.maps.evidence import Counts
-from rtmap_cli.steps.evaluate.changes import Change, score_changes
-from rtmap_cli.steps.evaluate.sight import Sight, in_view
+from rtmap_cli.steps.evaluate.changes.elements import Change, score_changes
+from rtmap_cli.steps.evaluate.changes.sight import Sight, in_view
 
 CRS = "EPSG:32617"
 ORIGIN = np.array([583_000.0, 4_477_000.0])

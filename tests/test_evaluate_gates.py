@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from rtmap_cli.errors import UsageError
-from rtmap_cli.steps.evaluate.baseline import Baseline, Drops, parse_drops
-from rtmap_cli.steps.evaluate.limits import Figure, past_limits
+from rtmap_cli.steps.evaluate.gates.baseline import Baseline, Drops, parse_drops
+from rtmap_cli.steps.evaluate.gates.limits import Figure, past_limits
 
 Write = Callable[..., Path]
 

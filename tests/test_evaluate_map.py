@@ -35,9 +35,9 @@ from rtmap_cli.logs.run import (
 )
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
-from rtmap_cli.steps.evaluate.compare import FrameSet, Settings, compare
 from rtmap_cli.steps.evaluate.drives import Drive
-from rtmap_cli.steps.evaluate.precision import average_precision, evaluate_frames
+from rtmap_cli.steps.evaluate.maps.compare import FrameSet, Settings, compare
+from rtmap_cli.steps.evaluate.maps.precision import average_precision, evaluate_frames
 
 CRS = "EPSG:32632"
 EAST, NORTH = 500_000.0, 5_000_000.0
@@ -318,7 +318,7 @@ def test_run_against_map(rtmap: Any, world: Path) -> None:
 def test_outdated_elements_are_no_predictions(world: Path) -> None:
     run = seen(town(), drive())
     run.observations.state[:] = OUTDATED
-    from rtmap_cli.steps.evaluate.frames import run_frames
+    from rtmap_cli.steps.evaluate.maps.frames import run_frames
 
     assert not any(run_frames(run, "run").frames.values())
 
@@ -338,7 +338,7 @@ def test_map_against_map(rtmap: Any, world: Path) -> None:
 
 
 def test_scores_of_map_elements_are_probabilities() -> None:
-    from rtmap_cli.steps.evaluate.frames import MapSide
+    from rtmap_cli.steps.evaluate.maps.frames import MapSide
 
     local = MapSide(town(), True).crop(drive().pose[4], (-36, -18, 36, 18))
     (divider,) = [e for e in local if e[0] == "divider"]
@@ -348,7 +348,7 @@ def test_scores_of_map_elements_are_probabilities() -> None:
 
 
 def test_other_crs_is_converted(world: Path) -> None:
-    from rtmap_cli.steps.evaluate.frames import in_crs
+    from rtmap_cli.steps.evaluate.maps.frames import in_crs
 
     other = in_crs(town(), "EPSG:32631")
     score = compare(other, town(), [drive()])

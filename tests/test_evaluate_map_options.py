@@ -13,9 +13,9 @@ import pytest
 
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
-from rtmap_cli.steps.evaluate.intervals import blocks_of, bootstrap
-from rtmap_cli.steps.evaluate.precision import Detection, Ranking, Scorer, evaluate_frames
-from rtmap_cli.steps.evaluate.shape import Shape, joints, measure, turning
+from rtmap_cli.steps.evaluate.maps.intervals import blocks_of, bootstrap
+from rtmap_cli.steps.evaluate.maps.precision import Detection, Ranking, Scorer, evaluate_frames
+from rtmap_cli.steps.evaluate.maps.shape import Shape, joints, measure, turning
 
 Frame = list[Detection]
 STRICT = (0.2, 0.5, 1.0, 2.0)

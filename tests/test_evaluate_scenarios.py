@@ -13,9 +13,9 @@ import shapely
 from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
-from rtmap_cli.steps.evaluate.compare import label_frames
 from rtmap_cli.steps.evaluate.drives import Drive, read_drives
-from rtmap_cli.steps.evaluate.scenarios import SCENARIOS, scenarios_of
+from rtmap_cli.steps.evaluate.maps.compare import label_frames
+from rtmap_cli.steps.evaluate.scenarios.labels import SCENARIOS, scenarios_of
 
 CRS = "EPSG:32632"
 EAST, NORTH = 500_000.0, 5_000_000.0

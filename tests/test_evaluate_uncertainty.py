@@ -31,8 +31,8 @@ from rtmap_cli.logs.run import (
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
-from rtmap_cli.steps.evaluate.precision import evaluate_frames
-from rtmap_cli.steps.evaluate.uncertainty import (
+from rtmap_cli.steps.evaluate.maps.precision import evaluate_frames
+from rtmap_cli.steps.evaluate.uncertainty.measure import (
     gaussian_nll,
     gaussian_ranks,
     laplace_nll,
@@ -41,7 +41,7 @@ from rtmap_cli.steps.evaluate.uncertainty import (
     share_figures,
     share_interval,
 )
-from rtmap_cli.steps.evaluate.uncertainty_vertices import across, real_ones
+from rtmap_cli.steps.evaluate.uncertainty.vertices import across, real_ones
 
 CRS = "EPSG:32632"
 ORIGIN = np.array([500_000.0, 5_000_000.0])

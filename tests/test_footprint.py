@@ -34,7 +34,7 @@ from rtmap_cli.maps.footprint import (
     union,
 )
 from rtmap_cli.maps.store import write_new_map
-from rtmap_cli.steps.evaluate.leak import Area, find_leak
+from rtmap_cli.steps.evaluate.gates.leak import Area, find_leak
 from rtmap_cli.steps.infer.contract import read_metadata
 
 CRS = "EPSG:32617"

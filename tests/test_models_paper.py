@@ -39,7 +39,7 @@ from rtmap_models.paper.resnet import ResNet, load_backbone  # noqa: E402
 from rtmap_models.tiny.decoder import LayerOutput  # noqa: E402
 
 from rtmap_cli.errors import BadInput  # noqa: E402
-from rtmap_cli.steps.evaluate.precision import Scorer  # noqa: E402
+from rtmap_cli.steps.evaluate.maps.precision import Scorer  # noqa: E402
 
 CAMERAS = 2
 

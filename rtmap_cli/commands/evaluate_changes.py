@@ -10,7 +10,7 @@ import click
 from rtmap_cli import options
 
 if TYPE_CHECKING:
-    from rtmap_cli.steps.evaluate.limits import Figure
+    from rtmap_cli.steps.evaluate.gates.limits import Figure
 
 
 @click.command("changes")
@@ -51,10 +51,10 @@ def command(
     """
     from rtmap_cli.errors import UsageError
     from rtmap_cli.output import emit
+    from rtmap_cli.steps.evaluate.changes.sight import sight_of
     from rtmap_cli.steps.evaluate.drives import read_drives
-    from rtmap_cli.steps.evaluate.gates import parse_gates
+    from rtmap_cli.steps.evaluate.gates.gates import parse_gates
     from rtmap_cli.steps.evaluate.judge import judge_changes, judge_scenes
-    from rtmap_cli.steps.evaluate.sight import sight_of
     from rtmap_cli.tables import read_json
 
     if traversal is not None and poses is None:
@@ -81,7 +81,7 @@ def command(
 
 
 def _figures(result: dict[str, Any]) -> dict[str, Figure]:
-    from rtmap_cli.steps.evaluate.limits import Figure
+    from rtmap_cli.steps.evaluate.gates.limits import Figure
 
     frames = result.get("frame_level", result)
     shares = ("precision", "recall", "f1", "ap")

@@ -103,16 +103,16 @@ def command(
     """
     from rtmap_cli.errors import UsageError
     from rtmap_cli.output import emit, log
-    from rtmap_cli.steps.evaluate.compare import (
+    from rtmap_cli.steps.evaluate.drives import read_drives
+    from rtmap_cli.steps.evaluate.gates.gates import parse_gates
+    from rtmap_cli.steps.evaluate.gates.leak import check_leak
+    from rtmap_cli.steps.evaluate.maps.compare import (
         Settings,
         compare_frames,
         range_of,
         read_side,
     )
-    from rtmap_cli.steps.evaluate.drives import read_drives
-    from rtmap_cli.steps.evaluate.gates import parse_gates
-    from rtmap_cli.steps.evaluate.leak import check_leak
-    from rtmap_cli.steps.evaluate.report import Wanted, report, scenario_labels
+    from rtmap_cli.steps.evaluate.maps.report import Wanted, report, scenario_labels
 
     gates = parse_gates(as_json, **gate_options)
     if traversal is not None and poses is None:

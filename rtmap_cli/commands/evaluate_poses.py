@@ -10,7 +10,7 @@ import click
 from rtmap_cli import options
 
 if TYPE_CHECKING:
-    from rtmap_cli.steps.evaluate.limits import Figure
+    from rtmap_cli.steps.evaluate.gates.limits import Figure
 
 
 @click.command("poses")
@@ -42,7 +42,7 @@ def command(
     from rtmap_cli.errors import UsageError
     from rtmap_cli.logs.run import read_run
     from rtmap_cli.output import emit
-    from rtmap_cli.steps.evaluate.gates import parse_gates
+    from rtmap_cli.steps.evaluate.gates.gates import parse_gates
     from rtmap_cli.steps.evaluate.judge import judge_pairs, judge_poses
 
     gates = parse_gates(as_json, **gate_options)
@@ -64,7 +64,7 @@ def command(
 
 
 def _figures(result: dict[str, Any]) -> dict[str, Figure]:
-    from rtmap_cli.steps.evaluate.limits import Figure
+    from rtmap_cli.steps.evaluate.gates.limits import Figure
 
     out = {
         f"{axis}.{name}": Figure(result[axis][name], "lower")

@@ -11,7 +11,7 @@ from rtmap_cli import options
 
 if TYPE_CHECKING:
     from rtmap_cli.steps.evaluate.drives import Drive
-    from rtmap_cli.steps.evaluate.limits import Figure
+    from rtmap_cli.steps.evaluate.gates.limits import Figure
 
 
 @click.command("uncertainty")
@@ -56,8 +56,8 @@ def command(
     from rtmap_cli.errors import UsageError
     from rtmap_cli.logs.open import folder_of
     from rtmap_cli.output import emit
-    from rtmap_cli.steps.evaluate.gates import parse_gates
-    from rtmap_cli.steps.evaluate.uncertainty_plot import write_plot
+    from rtmap_cli.steps.evaluate.gates.gates import parse_gates
+    from rtmap_cli.steps.evaluate.uncertainty.plot import write_plot
     from rtmap_cli.tables import refuse_existing, refuse_inside
 
     if traversal is not None and poses is None:
@@ -88,7 +88,7 @@ def _judge(
     from rtmap_cli.errors import UsageError
     from rtmap_cli.logs.run import read_run
     from rtmap_cli.steps.evaluate.drives import read_drives
-    from rtmap_cli.steps.evaluate.uncertainty_judge import judge_map, judge_run
+    from rtmap_cli.steps.evaluate.uncertainty.judge import judge_map, judge_run
 
     if (Path(pred) / "run.json").exists():
         if poses is None:
@@ -107,7 +107,7 @@ def _judge(
 def _map(path: str, drives: list[Drive], version: int | None = None) -> Any:
     from rtmap_cli.errors import BadInput
     from rtmap_cli.maps.element import VectorMap
-    from rtmap_cli.steps.evaluate.compare import read_side
+    from rtmap_cli.steps.evaluate.maps.compare import read_side
 
     side = read_side(path, False, drives, version)
     if not isinstance(side, VectorMap):
@@ -124,7 +124,7 @@ SHARES = {"scores": "scores", "existence": "existence"}
 
 
 def _figures(result: dict[str, Any]) -> dict[str, Figure]:
-    from rtmap_cli.steps.evaluate.limits import Figure
+    from rtmap_cli.steps.evaluate.gates.limits import Figure
 
     out: dict[str, Figure] = {}
     regions = {

@@ -123,7 +123,7 @@ def _footprint(
     from rtmap_models.training.checkpoint import footprint_of
 
     from rtmap_cli.maps.footprint import TOWNS, union
-    from rtmap_cli.steps.evaluate.leak import read_trained_on
+    from rtmap_cli.steps.evaluate.gates.leak import read_trained_on
 
     def read(spec: str) -> Any:
         if spec == "procedural":

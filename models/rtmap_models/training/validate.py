@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.steps.evaluate.precision import Detection, Scorer
+from rtmap_cli.steps.evaluate.maps.precision import Detection, Scorer
 from rtmap_models.config import ModelConfig
 from rtmap_models.data.dataset import Batch, Frames, Sample, collate, make_sample
 from rtmap_models.data.samples import PriorNoise, clip

@@ -15,7 +15,8 @@ from rtmap_cli.formats.changes_json import ChangeFile, read_changes
 from rtmap_cli.geometry.poses import se3_from_quaternion, se3_from_xyyaw
 from rtmap_cli.logs.run import Run
 from rtmap_cli.maps.crs import check_same_crs, lonlat_to, utm_crs
-from rtmap_cli.steps.evaluate.changes import (
+from rtmap_cli.steps.evaluate.changes.detection_time import time_to_detection
+from rtmap_cli.steps.evaluate.changes.elements import (
     FRAME_RANGE,
     Change,
     ChangeScore,
@@ -23,7 +24,7 @@ from rtmap_cli.steps.evaluate.changes import (
     frame_accuracy,
     score_changes,
 )
-from rtmap_cli.steps.evaluate.detection_time import time_to_detection
+from rtmap_cli.steps.evaluate.changes.sight import STEP, Sight, in_view
 from rtmap_cli.steps.evaluate.drives import Drive, drive_of, read_drives
 from rtmap_cli.steps.evaluate.poses import (
     UPRIGHT,
@@ -34,7 +35,6 @@ from rtmap_cli.steps.evaluate.poses import (
     upright_errors,
     whitened_errors,
 )
-from rtmap_cli.steps.evaluate.sight import STEP, Sight, in_view
 from rtmap_cli.tables import read_json
 
 Array = NDArray[np.float64]

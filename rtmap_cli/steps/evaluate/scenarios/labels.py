@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.evaluate.drives import Drive
-from rtmap_cli.steps.evaluate.junctions import RoadMap
-from rtmap_cli.steps.evaluate.trajectory import STEP, Trajectory
+from rtmap_cli.steps.evaluate.scenarios.junctions import RoadMap
+from rtmap_cli.steps.evaluate.scenarios.trajectory import STEP, Trajectory
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

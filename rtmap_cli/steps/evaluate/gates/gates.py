@@ -14,7 +14,7 @@ from typing import Any
 
 from rtmap_cli.errors import Findings, UsageError
 from rtmap_cli.output import plain, table
-from rtmap_cli.steps.evaluate.baseline import (
+from rtmap_cli.steps.evaluate.gates.baseline import (
     Baseline,
     Change,
     Drops,
@@ -22,7 +22,7 @@ from rtmap_cli.steps.evaluate.baseline import (
     read_baseline,
     say_setting,
 )
-from rtmap_cli.steps.evaluate.limits import (
+from rtmap_cli.steps.evaluate.gates.limits import (
     Figures,
     check_directions,
     parse_limits,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rtmap_cli.steps.evaluate.changes import Change, ChangeScore
+from rtmap_cli.steps.evaluate.changes.elements import Change, ChangeScore
 
 
 def time_to_detection(

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.steps.evaluate.frames import split_key
-from rtmap_cli.steps.evaluate.precision import Ranking
+from rtmap_cli.steps.evaluate.maps.frames import split_key
+from rtmap_cli.steps.evaluate.maps.precision import Ranking
 
 Array = NDArray[np.float64]
 

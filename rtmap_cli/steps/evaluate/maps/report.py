@@ -12,12 +12,12 @@ from rtmap_cli.errors import UsageError
 from rtmap_cli.maps.crop import Range
 from rtmap_cli.maps.element import RING_CLASSES, VectorMap
 from rtmap_cli.output import table
-from rtmap_cli.steps.evaluate.compare import Comparison, Side, label_frames
 from rtmap_cli.steps.evaluate.drives import Drive
-from rtmap_cli.steps.evaluate.intervals import FEW, Intervals, blocks_of, bootstrap
-from rtmap_cli.steps.evaluate.limits import Figure
-from rtmap_cli.steps.evaluate.precision import MapScore
-from rtmap_cli.steps.evaluate.shape import Shape
+from rtmap_cli.steps.evaluate.gates.limits import Figure
+from rtmap_cli.steps.evaluate.maps.compare import Comparison, Side, label_frames
+from rtmap_cli.steps.evaluate.maps.intervals import FEW, Intervals, blocks_of, bootstrap
+from rtmap_cli.steps.evaluate.maps.precision import MapScore
+from rtmap_cli.steps.evaluate.maps.shape import Shape
 
 Bools = NDArray[np.bool_]
 

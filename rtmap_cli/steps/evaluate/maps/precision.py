@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.steps.evaluate.matching import match
-from rtmap_cli.steps.evaluate.protocols import PROTOCOLS, THRESHOLDS, Detection
-from rtmap_cli.steps.evaluate.shape import MEASURES, Shape, measure
+from rtmap_cli.steps.evaluate.maps.matching import match
+from rtmap_cli.steps.evaluate.maps.protocols import PROTOCOLS, THRESHOLDS, Detection
+from rtmap_cli.steps.evaluate.maps.shape import MEASURES, Shape, measure
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def evaluate_frames(
 @dataclass(frozen=True)
 class Judged:
     """One frame and class: scores (n,) and hits (n, thresholds) of predictions, the number of true
-    elements, and the sums of ``steps.evaluate.shape`` where they were asked for."""
+    elements, and the sums of ``steps.evaluate.maps.shape`` where they were asked for."""
 
     scores: Array
     hits: NDArray[np.bool_]

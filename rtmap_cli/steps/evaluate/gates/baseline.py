@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rtmap_cli.errors import BadInput, UsageError
-from rtmap_cli.steps.evaluate.limits import Figures, number, show
+from rtmap_cli.steps.evaluate.gates.limits import Figures, number, show
 from rtmap_cli.tables import read_json
 
 MAX_DROP = 0.01

@@ -13,7 +13,7 @@ from rtmap_cli.errors import BadInput, NoAnswer, UsageError
 from rtmap_cli.maps.crop import Range
 from rtmap_cli.maps.element import CLASSES, VectorMap
 from rtmap_cli.steps.evaluate.drives import Drive, drive_of
-from rtmap_cli.steps.evaluate.frames import (
+from rtmap_cli.steps.evaluate.maps.frames import (
     FrameSet,
     MapSide,
     aligned,
@@ -23,9 +23,9 @@ from rtmap_cli.steps.evaluate.frames import (
     run_frames,
     split_key,
 )
-from rtmap_cli.steps.evaluate.pairs import Pairs
-from rtmap_cli.steps.evaluate.parallel import judge_all
-from rtmap_cli.steps.evaluate.precision import (
+from rtmap_cli.steps.evaluate.maps.pairs import Pairs
+from rtmap_cli.steps.evaluate.maps.parallel import judge_all
+from rtmap_cli.steps.evaluate.maps.precision import (
     PROTOCOLS,
     THRESHOLDS,
     Detection,
@@ -33,8 +33,8 @@ from rtmap_cli.steps.evaluate.precision import (
     MapScore,
     Scorer,
 )
-from rtmap_cli.steps.evaluate.scenarios import SCENARIOS, scenarios_of
-from rtmap_cli.steps.evaluate.whole import cell_range, cells_in, region_in_range
+from rtmap_cli.steps.evaluate.maps.whole import cell_range, cells_in, region_in_range
+from rtmap_cli.steps.evaluate.scenarios.labels import SCENARIOS, scenarios_of
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

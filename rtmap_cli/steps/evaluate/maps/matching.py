@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.chamfer import bands, beside, close_pairs, sample_lines
-from rtmap_cli.steps.evaluate.protocols import Detection, Protocol
+from rtmap_cli.steps.evaluate.maps.protocols import Detection, Protocol
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -10,8 +10,8 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.steps.evaluate.frames import MapSide
-from rtmap_cli.steps.evaluate.pairs import Pairs
+from rtmap_cli.steps.evaluate.maps.frames import MapSide
+from rtmap_cli.steps.evaluate.maps.pairs import Pairs
 
 CHUNK = 16
 """Frames that a process takes at a time."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.maps.crop import Range
-from rtmap_cli.steps.evaluate.frames import MapSide
-from rtmap_cli.steps.evaluate.precision import Detection
+from rtmap_cli.steps.evaluate.maps.frames import MapSide
+from rtmap_cli.steps.evaluate.maps.precision import Detection
 
 Array = NDArray[np.float64]
 ByFrame = Mapping[str, list[Detection]]

@@ -18,8 +18,8 @@ from rtmap_cli.geometry.chamfer import bands, chamfer_pairs, sample_lines
 from rtmap_cli.geometry.polylines import clip_to_box, is_ring, join_lines, length
 from rtmap_cli.maps.crop import Range
 from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
-from rtmap_cli.steps.evaluate.frames import MIN_AREA, MIN_LENGTH
-from rtmap_cli.steps.evaluate.precision import PROTOCOLS, Detection
+from rtmap_cli.steps.evaluate.maps.frames import MIN_AREA, MIN_LENGTH
+from rtmap_cli.steps.evaluate.maps.precision import PROTOCOLS, Detection
 
 Array = NDArray[np.float64]
 

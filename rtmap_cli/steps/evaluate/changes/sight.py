@@ -15,7 +15,7 @@ from rtmap_cli.logs.log import Log, Rig
 from rtmap_cli.logs.open import READERS, open_log
 from rtmap_cli.maps.crop import DEFAULT_RANGE, Range
 from rtmap_cli.maps.visibility import hidden
-from rtmap_cli.steps.evaluate.changes import FRAME_RANGE, distances_to_events
+from rtmap_cli.steps.evaluate.changes.elements import FRAME_RANGE, distances_to_events
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -17,8 +17,10 @@ from rtmap_cli.logs.traversal import range_box
 from rtmap_cli.maps.crop import DEFAULT_RANGE, joined
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.evaluate.drives import Drive, drive_of, read_drives
-from rtmap_cli.steps.evaluate.frames import MapSide, in_crs, probability
 from rtmap_cli.steps.evaluate.judge import pose_pairs, true_poses_of
+from rtmap_cli.steps.evaluate.maps.frames import MapSide, in_crs, probability
+from rtmap_cli.steps.evaluate.maps.precision import Detection
+from rtmap_cli.steps.evaluate.maps.whole import CELL, cells_in, region_in_range
 from rtmap_cli.steps.evaluate.poses import (
     chi_squares,
     effective_count,
@@ -26,22 +28,20 @@ from rtmap_cli.steps.evaluate.poses import (
     stated,
     whitened_errors,
 )
-from rtmap_cli.steps.evaluate.precision import Detection
-from rtmap_cli.steps.evaluate.uncertainty import (
+from rtmap_cli.steps.evaluate.uncertainty.existence import World
+from rtmap_cli.steps.evaluate.uncertainty.measure import (
     gaussian_nll,
     gaussian_ranks,
     line_figures,
     rank_figures,
     share_figures,
 )
-from rtmap_cli.steps.evaluate.uncertainty_existence import World
-from rtmap_cli.steps.evaluate.uncertainty_vertices import (
+from rtmap_cli.steps.evaluate.uncertainty.vertices import (
     Vertices,
     compare_vertices,
     map_vertices,
     real_ones,
 )
-from rtmap_cli.steps.evaluate.whole import CELL, cells_in, region_in_range
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from rtmap_cli.logs.run import OUTDATED, Run
 from rtmap_cli.maps.crop import MapIndex, Range
 from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
 from rtmap_cli.steps.evaluate.drives import Drive, drive_of
-from rtmap_cli.steps.evaluate.precision import Detection
+from rtmap_cli.steps.evaluate.maps.precision import Detection
 
 Array = NDArray[np.float64]
 

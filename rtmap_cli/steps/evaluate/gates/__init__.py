@@ -1,0 +1,1 @@
+"""What CI asks of every figure: limits, a baseline, no leak."""

@@ -1,0 +1,1 @@
+"""Average precision of maps, frame by frame and as a whole."""

@@ -1,0 +1,1 @@
+"""Where along a drive a frame stands: bends, loops, junctions, lanes."""

@@ -1,0 +1,1 @@
+"""Are sigmas, covariances and probabilities honest?"""
