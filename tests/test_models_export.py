@@ -261,6 +261,7 @@ def test_a_miss_writes_nothing_and_exits_1(
 
     monkeypatch.setattr(onnxruntime.InferenceSession, "run", off)
     call = ("export-model", weights, "-o", tmp_path / "m.onnx", "--report", tmp_path / "r.json")
+    call += ("--trained-on", "procedural")
     miss = rtmap(*call, "--json", code=1)
     assert json.loads(miss.out)["parity"]["within"] is False
     assert "differs from torch" in miss.err and len(miss.err.strip().splitlines()) == 1
