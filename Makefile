@@ -8,7 +8,7 @@ TESTS ?= tests
 comma := ,
 stamp = $(VENV)/.ready-$(subst $(comma),-,$(1))
 
-.PHONY: demo test lint bench bench-tables schemas clean
+.PHONY: demo test lint bench bench-tables bench-fleet schemas clean
 
 demo: $(call stamp,simulate)
 	$(BIN)/rtmap demo -o demo_out --overwrite
@@ -28,11 +28,14 @@ bench: $(call stamp,$(EXTRAS))
 bench-tables: $(call stamp,simulate)
 	$(BIN)/python benchmarks/paper_tables.py
 
+bench-fleet: $(call stamp,simulate)
+	$(BIN)/python benchmarks/fleet_tables.py $(if $(PARTS),--parts $(PARTS))
+
 schemas: $(call stamp,$(EXTRAS))
 	$(BIN)/python schemas/generate.py
 
 clean:
-	rm -rf $(VENV) build dist demo_out bench_tables .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) build dist demo_out bench_tables bench_fleet .pytest_cache .mypy_cache .ruff_cache
 
 $(VENV)/.ready-%: pyproject.toml
 	@test -n "$(PYTHON)" || { echo "make: no Python >= 3.11 found; set PYTHON=..." >&2; exit 3; }

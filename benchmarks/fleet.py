@@ -285,13 +285,21 @@ TESTS: dict[str, tuple[Callable[..., dict[str, Any]], Callable[..., list[str]]]]
 }
 
 
-def parse() -> argparse.Namespace:
+def check_golden(golden: Path | None) -> None:
+    """One line when the benchmark is not there."""
+    if golden is None:
+        sys.exit("fleet benchmark not found, set RTMAP_GOLDEN to the folder that holds fleet/")
+    if not (golden / "fleet").is_dir():
+        sys.exit(f"{golden} holds no folder fleet/, set RTMAP_GOLDEN to the one that does")
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("test", choices=TESTS)
-    parser.add_argument("--golden", type=Path, default=os.environ.get("RTMAP_GOLDEN"))
+    parser.add_argument("--golden", type=Path, default=os.environ.get("RTMAP_GOLDEN") or None)
     parser.add_argument("--maps", nargs="+", default=list(MAPS), choices=[*MAPS, REAL])
     parser.add_argument("--scenarios", nargs="+", default=list(SCENARIOS), choices=SCENARIOS)
     parser.add_argument("--cycles", nargs="+", type=int, default=[1, 2, 3, 5, 10])
@@ -305,9 +313,8 @@ def parse() -> argparse.Namespace:
         )
     parser.add_argument("--work", type=Path, help="keep the intermediate files in this folder")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
-    options = parser.parse_args()
-    if options.golden is None or not (options.golden / "fleet").is_dir():
-        parser.error("--golden DIR (or RTMAP_GOLDEN) must hold the folder fleet/")
+    options = parser.parse_args(arguments)
+    check_golden(options.golden)
     return options
 
 
