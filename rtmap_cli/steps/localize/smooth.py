@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,22 +50,19 @@ def solve_smooth(
     from it. An answer to a prior query leans on where the prior was put, in every frame alike,
     and counts once on either side of ``element_length_m``.
     """
-    pose, bias = _start(motion, start, first)
-    spacing = motion.spacing[seen.frame]
-    repeats = np.clip(model.element_length_m / spacing, 1.0, _MOST_REPEATS)
+    pose, bias = first_poses(motion, start, first)
     asked = seen.chain >= 0
-    once_asked = np.where(asked, np.minimum(2.0 * repeats, _MOST_REPEATS), 1.0)
-    map_repeats = np.clip(model.map_persist_m / spacing, 1.0, _MOST_REPEATS)
-    once = model.element_share + _FIELD_DOUBT * model.place_share
+    shares = shares_of(seen, motion.spacing, model)
+    map_repeats = shares.map_repeats
     chunk = chunks(motion.step, settings.chunk_m)
     field: PlaceField | None = None
     shift: Array | None = None
     for gate, doubt in zip(settings.smooth_gates_m, settings.smooth_doubts_m, strict=True):
         linear = linearize(lines, seen, pose, gate, shift)
         field = PlaceField(lines, seen, linear, chunk, model, field)
-        plain = noise_of(lines, seen, linear, model, once).doubted(linear, doubt)
+        plain = noise_of(lines, seen, linear, model, shares.judged).doubted(linear, doubt)
         judgement = judge(seen, linear, plain, linear.r + field.predict(), model, settings.huber)
-        noise = noise_of(lines, seen, linear, model, model.element_share * once_asked, map_repeats)
+        noise = noise_of(lines, seen, linear, model, shares.solved, map_repeats)
         weight, index = judgement.weight(noise), field.frame_index
         system, _, _ = _system(field, weight, noise, motion, pose, bias)
         step = system.solve()
@@ -74,14 +73,38 @@ def solve_smooth(
         shift[asked] = 0.0
     if field is None:
         raise ValueError("smooth_gates_m is empty")
-    share = model.element_share * np.maximum(repeats, once_asked)
-    noise = noise_of(lines, seen, linear, model, share, map_repeats)
+    noise = noise_of(lines, seen, linear, model, shares.stated, map_repeats)
     weight = judgement.weight(noise)
     system, information, chi2 = _system(field, weight, noise, motion, pose, bias)
     used = seen.sum_by_frame(((weight > 0) & (judgement.inlier[:, None] > 0.5)).sum(-1))
     covariance = _pose_blocks(system, chunk, index)
     spread = np.zeros_like(covariance)
     return Solution(pose, covariance, information, chi2, used.astype(np.int64), spread)
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares (E,) of the stated variance that the offset of an element has: where it is
+    ``judged``, ``solved`` for and in the ``stated`` covariance; ``map_repeats`` (E,): frames that
+    see one error of the map."""
+
+    judged: float
+    solved: Array
+    stated: Array
+    map_repeats: Array
+
+
+def shares_of(seen: Detections, spacing: Array, model: ErrorModel) -> Shares:
+    """How often errors are counted; ``spacing`` (T,) metres between frames."""
+    between = spacing[seen.frame]
+    repeats = np.clip(model.element_length_m / between, 1.0, _MOST_REPEATS)
+    asked = np.where(seen.chain >= 0, np.minimum(2.0 * repeats, _MOST_REPEATS), 1.0)
+    return Shares(
+        judged=model.element_share + _FIELD_DOUBT * model.place_share,
+        solved=model.element_share * asked,
+        stated=model.element_share * np.maximum(repeats, asked),
+        map_repeats=np.clip(model.map_persist_m / between, 1.0, _MOST_REPEATS),
+    )
 
 
 def _system(
@@ -121,7 +144,7 @@ def _pose_blocks(system: BlockSystem, chunk: Index, index: Index) -> Array:
     return out
 
 
-def _start(motion: Motion, single: Solution, first: Array | None) -> tuple[Array, Array]:
+def first_poses(motion: Motion, single: Solution, first: Array | None) -> tuple[Array, Array]:
     """Poses and biases from GNSS, odometry and single-frame answers, with robust weights.
 
     A frame that fell for the next lane disagrees with its neighbours and loses its vote.
