@@ -47,24 +47,31 @@ class Motion:
         return np.maximum(0.5 * (after + before), 0.05)
 
 
-def motion_of(frames: RunFrames, gnss: Array, model: ErrorModel, settings: Settings) -> Motion:
+def motion_of(
+    frames: RunFrames,
+    gnss: Array,
+    model: ErrorModel,
+    settings: Settings,
+    known: int | None = None,
+) -> Motion:
     """The motion of a run; ``gnss`` (T, 3) its initial poses relative to the map's origin.
 
     The stated sigma of an initial pose is split: what jumps from frame to frame against odometry
-    is white, the rest is a bias that walks. White noise is measured in the run itself.
+    is white, the rest is a bias that walks. White noise is measured in the run itself, in its
+    first ``known`` frames (default: all).
     """
     gnss = gnss.copy()
     gnss[:, 2] = np.unwrap(gnss[:, 2])
     odometry, given = frames.odometry.astype(np.float64), frames.odometry_sigma
-    known = np.asarray(np.isfinite(odometry).all(1))
-    known[0] = False
+    stepped = np.asarray(np.isfinite(odometry).all(1))
+    stepped[0] = False
     moved = np.zeros(len(gnss))
     moved[1:] = np.hypot(*np.diff(gnss[:, :2], axis=0).T)
-    step = np.where(known, np.hypot(odometry[:, 0], odometry[:, 1]), moved)
+    step = np.where(stepped, np.hypot(odometry[:, 0], odometry[:, 1]), moved)
     shares = np.array([settings.odometry_share] * 2 + [settings.odometry_rad_per_m])
     assumed = np.maximum(shares * step[:, None], [0.002, 0.002, 1e-4])
     usable = np.isfinite(given) & (given > 0)
-    white = _white(gnss, odometry, known, frames.sigma)
+    white = _white(gnss[:known], odometry[:known], stepped[:known], frames.sigma)
     slow = np.sqrt(frames.sigma**2 - white**2)
     length = np.full_like(slow, model.gnss_yaw_length_m)
     length[:, :2] = 2.0 * (slow[:, :2] / model.gnss_walk_m) ** 2
@@ -74,7 +81,7 @@ def motion_of(frames: RunFrames, gnss: Array, model: ErrorModel, settings: Setti
         white=white,
         slow=slow,
         keep=keep,
-        odometry=np.where(known[:, None], odometry, np.nan),
+        odometry=np.where(stepped[:, None], odometry, np.nan),
         odometry_sigma=np.where(usable, given, assumed),
         step=step,
     )
