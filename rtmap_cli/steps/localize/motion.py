@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ Array = NDArray[np.float64]
 
 STATE = 6
 """Unknowns per frame: x, y, yaw and the bias of GNSS in each."""
+
+REACH = STATE + 1
+"""How many unknowns further on one may be coupled: x with the y of the next frame."""
 
 _MIN_STEPS = 8
 """Fewer known odometry steps than this say nothing about the noise of GNSS."""
@@ -38,6 +42,11 @@ class Motion:
     odometry: Array
     odometry_sigma: Array
     step: Array
+
+    @cached_property
+    def fixed(self) -> _Fixed:
+        """What is the same at all poses."""
+        return _fixed(self)
 
     @property
     def spacing(self) -> Array:
@@ -103,66 +112,152 @@ def _white(gnss: Array, odometry: Array, known: NDArray[np.bool_], sigma: Array)
 
 
 @dataclass(frozen=True)
-class MotionTerms:
-    """Normal equations of a drive without a map, `STATE` unknowns a frame: ``own`` (T, 6, 6) of
-    each frame, ``below`` (T, 6, 6) of each with the one before (the first is zero), ``gradient``
-    (T, 6)."""
+class _Fixed:
+    """What of the normal equations is the same at all poses.
 
-    own: Array
-    below: Array
+    ``white`` (T, 3), ``walk`` (T - 1, 3), ``first`` (3,): information of GNSS, of the steps of its
+    bias and of the first one; ``odometry``, ``weight`` (3, T - 1) to the frame after, with the
+    weight zero where it is unknown; ``band`` (T, STATE, REACH + 1).
+    """
+
+    white: Array
+    walk: Array
+    first: Array
+    odometry: Array
+    weight: Array
+    band: Array
+
+
+def _fixed(motion: Motion) -> _Fixed:
+    """The linear factors of a drive: GNSS, its bias, and what odometry says of yaw."""
+    keep = motion.keep[1:]
+    white, first = motion.white**-2, motion.slow[0] ** -2
+    walk = 1.0 / ((1.0 - keep * keep) * motion.slow[1:] ** 2)
+    known = np.isfinite(motion.odometry[1:]).all(1, keepdims=True)
+    odometry = np.where(known, motion.odometry[1:], 0.0)
+    weight = np.where(known, motion.odometry_sigma[1:], np.inf) ** -2
+    band = np.zeros((len(white), STATE, REACH + 1))
+    on = band[:, :, 0]
+    on[:, :3] = on[:, 3:] = white
+    band[:, :3, 3] = white
+    on[0, 3:] += first
+    on[1:, 3:] += walk
+    on[:-1, 3:] += keep * keep * walk
+    band[:-1, 3:, STATE] = -keep * walk
+    on[:-1, 2] += weight[:, 2]
+    on[1:, 2] += weight[:, 2]
+    band[:-1, 2, STATE] = -weight[:, 2]
+    rows = np.ascontiguousarray(np.stack([odometry, weight]).swapaxes(1, 2))
+    return _Fixed(white, walk, first, rows[0], rows[1], band)
+
+
+@dataclass(frozen=True)
+class MotionTerms:
+    """Normal equations of a drive without a map, `STATE` unknowns a frame.
+
+    ``band`` (T, STATE, `REACH` + 1): element [t, i, d] is that of unknown i of frame t and the
+    d-th unknown after it, as LAPACK wants its lower bands; ``gradient`` (T, STATE).
+    """
+
+    band: Array
     gradient: Array
 
+    def add(self, information: Array, gradient: Array) -> None:
+        """Add what else is known of every pose: (T, 3, 3) and (T, 3)."""
+        for i in range(3):
+            self.band[:, i, : 3 - i] += information[:, i, i:]
+        self.gradient[:, :3] += gradient
+
     def solve(self) -> Array:
-        """(T, 6) the step to the minimum (a band of twice a frame's unknowns)."""
-        count = len(self.own)
-        band: Array = np.zeros((2 * STATE, count, STATE))
-        for row in range(STATE):
-            for column in range(STATE):
-                if row >= column:
-                    band[row - column, :, column] = self.own[:, row, column]
-                band[STATE + row - column, :-1, column] = self.below[1:, row, column]
-        flat = band.reshape(2 * STATE, -1)
-        step = solveh_banded(flat, -self.gradient.ravel(), lower=True, check_finite=False)
-        return np.asarray(step, np.float64).reshape(count, STATE)
+        """(T, STATE) the step to the minimum; the band is factored in place and thus used up."""
+        step = solveh_banded(
+            self.band.reshape(-1, REACH + 1).T,
+            -self.gradient.ravel(),
+            overwrite_ab=True,
+            overwrite_b=True,
+            lower=True,
+            check_finite=False,
+        )
+        return np.asarray(step, np.float64).reshape(self.gradient.shape)
+
+    @property
+    def own(self) -> Array:
+        """(T, STATE, STATE) of each frame with itself; read-only."""
+        out = np.zeros((len(self.band), STATE, STATE))
+        for i in range(STATE):
+            out[:, i, i:] = out[:, i:, i] = self.band[:, i, : STATE - i]
+        out.flags.writeable = False
+        return out
+
+    @property
+    def below(self) -> Array:
+        """(T, STATE, STATE) of each frame with the one before (the first is zero); read-only."""
+        out = np.zeros((len(self.band), STATE, STATE))
+        for i in range(STATE):
+            rows = min(i + REACH - STATE + 1, STATE)
+            out[1:, :rows, i] = self.band[:-1, i, STATE - i : STATE - i + rows]
+        out.flags.writeable = False
+        return out
 
 
 def motion_terms(motion: Motion, pose: Array, bias: Array) -> MotionTerms:
     """GNSS, bias and odometry factors at poses and biases (T, 3)."""
-    count = len(pose)
-    own, below = np.zeros((count, STATE, STATE)), np.zeros((count, STATE, STATE))
-    gradient = np.zeros((count, STATE))
-    on, off = (np.einsum("tii->ti", m) for m in (own, below))  # views of the diagonals
+    fixed = motion.fixed
+    terms = MotionTerms(fixed.band.copy(), np.empty((len(pose), STATE)))
+    gradient = terms.gradient
     # gnss = pose + bias + white; the first bias has the sigma of all.
     error = pose + bias - motion.gnss
     error[:, 2] = wrap_angle(error[:, 2])
-    weight = motion.white**-2
-    on += np.tile(weight, 2)
-    for both in (own[:, :3, 3:], own[:, 3:, :3]):
-        np.einsum("tii->ti", both)[...] += weight
-    gradient += np.tile(weight * error, 2)
-    prior = motion.slow[0] ** -2
-    on[0, 3:] += prior
-    gradient[0, 3:] += prior * bias[0]
+    error *= fixed.white
+    gradient[:, :3] = gradient[:, 3:] = error
+    gradient[0, 3:] += fixed.first * bias[0]
     # The bias decays towards zero as it walks.
     keep = motion.keep[1:]
-    weight = 1.0 / ((1.0 - keep * keep) * motion.slow[1:] ** 2)
-    error = weight * (bias[1:] - keep * bias[:-1])
-    on[1:, 3:] += weight
-    on[:-1, 3:] += keep * keep * weight
-    off[1:, 3:] -= keep * weight
+    error = fixed.walk * (bias[1:] - keep * bias[:-1])
     gradient[1:, 3:] += error
     gradient[:-1, 3:] -= keep * error
-    # The motion is what odometry says.
-    t = 1 + np.flatnonzero(np.isfinite(motion.odometry[1:]).all(1))
-    error, jacobian = step_error(pose[t - 1], pose[t], motion.odometry[t])
-    weighted = np.swapaxes(jacobian * motion.odometry_sigma[t, :, None] ** -2, -1, -2)
-    square, pull = weighted @ jacobian, (weighted @ error[..., None])[..., 0]
-    own[t - 1, :3, :3] += square[:, :3, :3]
-    own[t, :3, :3] += square[:, 3:, 3:]
-    below[t, :3, :3] += square[:, 3:, :3]
-    gradient[t - 1, :3] += pull[:, :3]
-    gradient[t, :3] += pull[:, 3:]
-    return MotionTerms(own, below, gradient)
+    _add_odometry(terms, fixed, pose)
+    return terms
+
+
+def _add_odometry(terms: MotionTerms, fixed: _Fixed, pose: Array) -> None:
+    """The motion is what odometry says: `step_error` and its Jacobian J, multiplied out.
+
+    With R the turn of the frame before and W the weights, the weighted square of J by both poses
+    consists of M = R W Rᵀ, of h = R W g with g = (moved y, -moved x), and of gᵀ W g.
+    """
+    c, s = np.cos(pose[:-1, 2]), np.sin(pose[:-1, 2])
+    dx, dy, turned = (pose[1:] - pose[:-1]).T
+    mx, my = c * dx + s * dy, c * dy - s * dx
+    wx, wy, wa = fixed.weight
+    ox, oy, oa = fixed.odometry
+    ex, ey, ea = wx * (mx - ox), wy * (my - oy), wa * wrap_angle(turned - oa)
+    gx, gy = wx * my, wy * mx
+    xx, yy, xy = c * c * wx + s * s * wy, s * s * wx + c * c * wy, c * s * (wx - wy)
+    hx, hy = c * gx + s * gy, s * gx - c * gy
+    before, after = terms.band[:-1], terms.band[1:]
+    for end in (before, after):
+        end[:, 0, 0] += xx
+        end[:, 1, 0] += yy
+        end[:, 0, 1] += xy
+    before[:, 2, 0] += gx * my + gy * mx
+    before[:, 0, 2] -= hx
+    before[:, 1, 1] -= hy
+    # From here on the second index counts from the frame before to this one.
+    np.negative(xx, out=before[:, 0, STATE])
+    np.negative(yy, out=before[:, 1, STATE])
+    np.negative(xy, out=before[:, 0, STATE + 1])
+    np.negative(xy, out=before[:, 1, STATE - 1])
+    before[:, 2, STATE - 2] = hx
+    before[:, 2, STATE - 1] = hy
+    fx, fy = c * ex - s * ey, s * ex + c * ey
+    before, after = terms.gradient[:-1], terms.gradient[1:]
+    before[:, 0] -= fx
+    before[:, 1] -= fy
+    before[:, 2] += ex * my - ey * mx - ea
+    after[:, 0] += fx
+    after[:, 1] += fy
+    after[:, 2] += ea
 
 
 def step_error(before: Array, after: Array, odometry: Array) -> tuple[Array, Array]:

@@ -160,8 +160,8 @@ def first_poses(motion: Motion, single: Solution, first: Array | None) -> tuple[
         d = pose - single.pose
         d[:, 2] = wrap_angle(d[:, 2])
         share = _START_SHARE * trust
-        terms.own[:, :3, :3] += share[:, None, None] * information
-        terms.gradient[:, :3] += share[:, None] * (information @ d[..., None])[..., 0]
+        pull = (information @ d[..., None])[..., 0]
+        terms.add(share[:, None, None] * information, share[:, None] * pull)
         step = terms.solve()
         pose, bias = pose + step[:, :3], bias + step[:, 3:]
         d = pose - single.pose
