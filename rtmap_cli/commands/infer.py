@@ -33,9 +33,7 @@ from rtmap_cli.output import emit, log, progress
 @click.option(
     "--batch",
     type=click.IntRange(1),
-    default=4,
-    show_default=True,
-    help="Frames per call of the network.",
+    help="Frames per call of the network (default: 1 on a CPU, 4 elsewhere).",
 )
 @click.option("--frames", "max_frames", type=click.IntRange(1), help="Stop after so many frames.")
 @click.option(
@@ -67,7 +65,7 @@ def command(
     model: str,
     score_threshold: float,
     existence_threshold: float,
-    batch: int,
+    batch: int | None,
     max_frames: int | None,
     every: int,
     level: bool,
@@ -110,11 +108,11 @@ def command(
     if prior is not None:
         check_same_crs(prior.crs, source.crs, str(map_path))
         check_prior_in_range(prior, source, str(map_path))
-    network = MapModel(model, threads)
+    network = MapModel(model, threads=1)  # a frame each: faster than all of them on one frame
     settings = InferOptions(
         score_threshold=score_threshold,
         existence_threshold=existence_threshold,
-        batch=batch,
+        batch=batch or (1 if network.on_cpu else 4),
         threads=threads or os.cpu_count() or 1,
         skip_bad_frames=skip_bad_frames,
         max_frames=max_frames,

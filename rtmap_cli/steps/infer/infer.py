@@ -1,10 +1,15 @@
-"""Read a log with a network: {M, U, D, T^E} = Model(images, prior) of Eq. 1, frame by frame."""
+"""Read a log with a network: {M, U, D, T^E} = Model(images, prior) of Eq. 1, frame by frame.
+
+Frames do not depend on one another: with several threads several of them are read at the same
+time, each on one thread, which keeps all cores busier than one frame on all of them would.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +33,7 @@ from rtmap_cli.logs.run import (
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.prior import PriorSlots, on_prior, prior_slots
+from rtmap_cli.steps.infer.ahead import in_order
 from rtmap_cli.steps.infer.duplicates import fade_duplicates
 from rtmap_cli.steps.infer.images import FittedCamera
 from rtmap_cli.steps.infer.levelling import RoadUnder
@@ -40,7 +46,8 @@ Progress = Callable[[Iterable[Any]], Iterable[Any]]
 @dataclass(frozen=True)
 class InferOptions:
     """``score_threshold``: new elements below it are dropped; ``existence_threshold``: prior
-    elements below it are outdated; ``batch``: frames per call; ``threads``: decoding threads;
+    elements below it are outdated; ``batch``: frames per call; ``threads``: how many threads decode
+    images and, on a CPU, run the network, each for other frames (no answer depends on it);
     ``skip_bad_frames``: leave out frames that cannot be read and count them;
     ``max_frames``: stop after so many; ``every``: take every n-th frame; ``level``: turn the
     cameras to how the road lies (`RoadUnder`); ``looks``: how often the network is asked, each time
@@ -48,7 +55,7 @@ class InferOptions:
 
     score_threshold: float = 0.05
     existence_threshold: float = 0.5
-    batch: int = 4
+    batch: int = 1
     threads: int = 2
     skip_bad_frames: bool = False
     max_frames: int | None = None
@@ -66,6 +73,19 @@ class _Loaded:
     frame: Frame
     images: NDArray[np.uint8]
     ego_to_image: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """Of one frame (its images are let go): ``pose`` (3,) and ``covariance`` (3, 3) end to end, NaN
+    without a prior; ``dropped`` prior elements found no slot."""
+
+    frame: Frame
+    cameras: int
+    observations: Observations
+    pose: Array
+    covariance: Array
+    dropped: int
 
 
 def infer_log(
@@ -92,31 +112,28 @@ def infer_log(
         for camera in log.rig
     }
     road = RoadUnder([f.map_SE3_ego for f in log.frames()], prior) if options.level else None
-    rows: list[tuple[Frame, int, Array, Array]] = []
-    parts: list[Observations] = []
-    skipped = dropped = 0
-    stream = _chosen(log, options)
-    with ThreadPoolExecutor(options.threads) as pool:
-        for batch in _batches(
-            progress(_load_all(stream, cameras, road, pool, options)), options.batch
-        ):
-            good = []
-            for item in batch:
+    answers: list[_Answer] = []
+    skipped = 0
+    pool = ThreadPoolExecutor(options.threads)
+    try:
+        # In the pool's queue work stands in the order in which it is wanted.
+        load = partial(_load, cameras=cameras, road=road, skip=options.skip_bad_frames)
+        loaded = in_order(load, _chosen(log, options), pool, 2 * options.threads + options.batch)
+        answer = partial(_answers, model=model, index=index, options=options)
+        batches = _batches(progress(loaded), options.batch)
+        for some in in_order(answer, batches, pool, options.threads + 1 if model.on_cpu else 1):
+            for item in some:
                 if isinstance(item, BadInput):
                     skipped += 1
                     say(f"skipped: {item}")
                 else:
-                    good.append(item)
-            if not good:
-                continue
-            poses, slots, out = _look(model, index, good, options.looks)
-            dropped += sum(s.dropped for s in slots)
-            for k, item in enumerate(good):
-                parts.append(_observations(model, out, k, item.frame.index, slots[k], options))
-                pose, covariance = _end_to_end(poses[k], out, k, len(slots[k]))
-                rows.append((item.frame, len(item.images), pose, covariance))
-    if not rows:
+                    answers.append(item)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    if not answers:
         raise NoAnswer(f"{log.path}: no frame could be read")
+    rows = [(a.frame, a.cameras, a.pose, a.covariance) for a in answers]
+    dropped = sum(a.dropped for a in answers)
     if dropped:
         say(
             f"{dropped} prior elements found no slot (the model has {model.info.prior_slots}): in "
@@ -133,14 +150,14 @@ def infer_log(
         model=model.info.name,
         model_sha256=model.info.sha256,
         model_footprint=model.info.footprint.as_json(),
-        options=asdict(options),
+        options={k: v for k, v in asdict(options).items() if k != "threads"},
         frames=len(rows),
         skipped_frames=skipped,
         prior_elements_without_slot=dropped,
         map_version=prior.version if prior is not None else None,
         **(made_by or {}),
     )  # fmt: skip
-    observations = Observations.concatenate(parts)
+    observations = Observations.concatenate([a.observations for a in answers])
     return Run(info, _frames(rows), observations, _occluders(rows))
 
 
@@ -167,44 +184,24 @@ def _chosen(log: Log, options: InferOptions) -> Iterator[Frame]:
         yield frame
 
 
-def _load(frame: Frame, cameras: dict[str, FittedCamera], road: RoadUnder | None) -> _Loaded:
-    names = [name for name in cameras if name in frame.images]
-    if not names:
-        raise BadInput(
-            f"frame {frame.index}", "has no images", "simulate them (rtmap simulate images) or skip"
-        )
-    images = np.stack([cameras[name].load(frame.images[name]) for name in names])
-    matrices = np.stack([cameras[name].at(frame.ego_SE3_exposure.get(name)) for name in names])
+def _load(
+    frame: Frame, cameras: dict[str, FittedCamera], road: RoadUnder | None, skip: bool
+) -> _Loaded | BadInput:
+    """What the network is given of a frame; with ``skip`` an error is returned, not raised."""
+    try:
+        names = [name for name in cameras if name in frame.images]
+        if not names:
+            todo = "simulate them (rtmap simulate images) or skip"
+            raise BadInput(f"frame {frame.index}", "has no images", todo)
+        images = np.stack([cameras[name].load(frame.images[name]) for name in names])
+        matrices = np.stack([cameras[name].at(frame.ego_SE3_exposure.get(name)) for name in names])
+    except BadInput as error:
+        if not skip:
+            raise
+        return error
     if road is not None:
         matrices = levelled(matrices, road.plane(frame.map_SE3_ego)).astype(np.float32)
     return _Loaded(frame, images, matrices)
-
-
-def _load_all(
-    frames: Iterator[Frame],
-    cameras: dict[str, FittedCamera],
-    road: RoadUnder | None,
-    pool: ThreadPoolExecutor,
-    options: InferOptions,
-) -> Iterator[_Loaded | BadInput]:
-    """Decode ahead of the network, a bounded number of frames at a time, in order."""
-    from collections import deque
-
-    def guarded(frame: Frame) -> _Loaded | BadInput:
-        try:
-            return _load(frame, cameras, road)
-        except BadInput as error:
-            if not options.skip_bad_frames:
-                raise
-            return error
-
-    waiting: deque[Any] = deque()
-    for frame in frames:
-        waiting.append(pool.submit(guarded, frame))
-        if len(waiting) >= 2 * options.threads + options.batch:
-            yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()
 
 
 def _batches(items: Iterable[_Loaded | BadInput], size: int) -> Iterator[list[_Loaded | BadInput]]:
@@ -220,6 +217,31 @@ def _batches(items: Iterable[_Loaded | BadInput], size: int) -> Iterator[list[_L
         batch.append(item)
     if batch:
         yield batch
+
+
+def _answers(
+    batch: list[_Loaded | BadInput],
+    model: MapModel,
+    index: MapIndex | None,
+    options: InferOptions,
+) -> list[_Answer | BadInput]:
+    """What the network says of each frame of a batch, errors of frames in their places."""
+    good = [item for item in batch if isinstance(item, _Loaded)]
+    if not good:
+        return [item for item in batch if isinstance(item, BadInput)]
+    poses, slots, out = _look(model, index, good, options.looks)
+    answers: list[_Answer | BadInput] = []
+    k = 0
+    for item in batch:
+        if isinstance(item, BadInput):
+            answers.append(item)
+            continue
+        seen = _observations(model, out, k, item.frame.index, slots[k], options)
+        pose, covariance = _end_to_end(poses[k], out, k, len(slots[k]))
+        about = (item.frame, len(item.images))
+        answers.append(_Answer(*about, seen, pose, covariance, slots[k].dropped))
+        k += 1
+    return answers
 
 
 def _look(

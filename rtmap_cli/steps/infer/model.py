@@ -28,7 +28,8 @@ remote services, of which the graph has none."""
 
 class MapModel:
     """An ONNX session that holds a model to its contract: when it is opened its metadata against
-    its graph, and every answer against both."""
+    its graph, and every answer against both. ``threads`` work on one call (default: all cores);
+    several calls may run at the same time."""
 
     def __init__(self, name_or_path: str, threads: int | None = None) -> None:
         import onnxruntime as ort
@@ -47,6 +48,7 @@ class MapModel:
             self.session = ort.InferenceSession(content, options, providers=providers)
         except Exception as error:  # onnxruntime raises its own untyped errors
             raise BadInput(self.path, f"cannot be loaded as ONNX ({first_line(error)})") from None
+        self.on_cpu = self.session.get_providers() == ["CPUExecutionProvider"]
         metadata = self.session.get_modelmeta().custom_metadata_map
         self.info = read_metadata(self.path, metadata, hashlib.sha256(content).hexdigest())
         check_graph(
