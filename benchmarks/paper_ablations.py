@@ -1,139 +1,187 @@
 """The paper's ablations on simulated frames: what each part of the training brings.
 
-    python benchmarks/paper_ablations.py --steps 2000 --data DIR
+    python benchmarks/paper_ablations.py --data DIR --json FILE
+    python benchmarks/paper_tables.py --tables 4 --ablations FILE
 
-Trains the same small configuration of the paper's network four times for as many steps, on the same
-frames in the same order: in full, without L_pose, without L_nll, without the pre-attribution.
-Prints, on towns that training did not see, mAP, existence and the pose from starts of 1 m / 1°
-(15 % of the prior missing, 15 % false), beside the rows of the paper. The paper's figures are from
-real logs and far longer training: the order of the rows is what can be compared, and with one seed
-only where they are far apart. What was trained in DIR is not trained again; an interrupted variant
-goes on where its checkpoint stood. Needs the extras ``train`` and ``simulate``.
+Trains the same small configuration of the paper's network for as many steps each, on the same
+frames in the same order: in full, without L_pose, without L_nll, without the pre-attribution, and
+in full once more with other first weights and another order, to see what chance does. The default
+configuration reads the warped bird's-eye picture in place of the cameras, and all variants start
+from one encoder that was taught to see elements: that learns within the hours of a core.
+``--config rtmap-r18-small`` reads the cameras, for machines with a GPU.
+
+Prints, on towns that training did not see, mAP without and with a prior, existence, and the pose
+from starts of 1 m / 1° (15 % of the prior missing, 15 % false), beside the rows of the paper; and
+how much every variant differs from the full one on the same frames, with 95 % intervals over towns.
+The paper's figures are from real logs and far longer training: the sign of a difference is what can
+be compared. What was trained in DIR is not trained again; an interrupted variant goes on where its
+checkpoint stood. Needs the extras ``train`` and ``simulate``.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import ablation_figures as measured
 import numpy as np
-import torch
-from numpy.typing import NDArray
+from ablation_encoder import train_encoder
+from paper_print import ablation_tables
 from rtmap_models.config import PaperConfig, load_config
-from rtmap_models.data.dataset import Frames, collate, make_sample
+from rtmap_models.data.dataset import Frames
 from rtmap_models.data.generate import generate
-from rtmap_models.training.checkpoint import load_network
+from rtmap_models.training.checkpoint import load_network, load_resumable
 from rtmap_models.training.recipe import load_recipe
 from rtmap_models.training.train import TrainOptions, train
-from rtmap_models.training.validate import CHANGED, validate
 
-VARIANTS: dict[str, dict[str, Any]] = {
-    "full": {},
-    "without L_pose": {"use_pose_loss": False},
-    "without L_nll": {"use_nll": False},
-    "without pre-attribution": {"pre_attribution": False},
+
+@dataclass(frozen=True)
+class Variant:
+    """What of the configuration is changed, and the seed of weights and order."""
+
+    changes: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+
+
+FULL = "full"
+VARIANTS = {
+    FULL: Variant(),
+    "without L_pose": Variant({"use_pose_loss": False}),
+    "without L_nll": Variant({"use_nll": False}),
+    "without pre-attribution": Variant({"pre_attribution": False}),
+    "full, another seed": Variant(seed=1),
 }
-
-PAPER = """\
-Paper, Tab. 4 (nuScenes; optimised pose; mean / 90 %: lateral m, longitudinal m, yaw °)
-  full               .121/.257   .586/1.429   .368/.799
-  without L_pose     .118/.242   .609/1.507   .376/.841   (its row "+ L_pts")
-  without L_nll      .122/.261   .590/1.436   .371/.800   (its row "+ L_pose")
-  without both       .122/.254   .618/1.510   .390/.840   (its base)
-  regressed pose     .142/.306   .589/1.447   .521/1.091  (T_E; ours: "learned head")
-Paper, Tab. 3 (TbV)
-  all of Q_prior     .163/.318   .686/1.616   .332/.766
-  only Q_map         .125/.256   .633/1.530   .317/.713
-The paper has no row without pre-attribution."""
-
-Array = NDArray[np.float64]
-BATCH = 8
+TRAIN_SEED, TEST_SEED = 1, 900
+TEST_PER_TOWN = 8
 
 
-@torch.no_grad()
-def pose_errors(network: Any, frames: Frames, limit: int) -> dict[str, Array]:
-    """(n, 3) absolute errors of dx, dy (m) and dyaw (°) by the way the pose is found."""
-    rng = np.random.default_rng(2)
-    errors: dict[str, list[Array]] = {}
-    for start in range(0, min(limit, len(frames)), BATCH):
-        chosen = range(start, min(start + BATCH, limit, len(frames)))
-        samples = [
-            make_sample(frames[k], network.config, rng, CHANGED, "seen", train=False)
-            for k in chosen
-        ]
-        batch = collate(samples, network.config)
-        prediction = network.predict_batch(batch)
-        prior = (batch.prior_points, batch.prior_class, batch.prior_mask)
-        answer = network.answer(prediction, *prior)
-        n = prediction.new_count
-        points, scale = answer.points[:, n:], answer.sigma[:, n:]
-        kept = (answer.prior_score >= 0.5).float()
-        found = {
-            "start": torch.zeros_like(batch.delta),
-            "all of Q_prior": network.pose(prior[0], points, scale, batch.prior_mask).delta,
-            "only Q_map": network.pose(prior[0], points, scale, kept).delta,
-        }
-        if network.config.use_pose_loss:
-            found["learned head"] = prediction.poses[-1]
-        for name, delta in found.items():
-            off = (delta - batch.delta).abs().double().numpy() * [1.0, 1.0, np.degrees(1.0)]
-            errors.setdefault(name, []).append(off)
-    return {name: np.concatenate(parts) for name, parts in errors.items()}
+def minutes_of(weights: Path) -> float:
+    """CPU minutes that went into weights so far."""
+    ledger = weights.with_suffix(".cpu.json")
+    return float(json.loads(ledger.read_text(encoding="utf-8"))) if ledger.exists() else 0.0
 
 
-def report(name: str, network: Any, frames: Frames, limit: int) -> dict[str, Any]:
-    """Print the figures of one variant; mean and 90th percentile errors by way of the pose."""
-    values = validate(network, frames, limit)
-    shown = ("mAP", "mAP prior", "mAP unchanged prior", "AUC existence")
-    print(f"{name}: " + ", ".join(f"{k} {values[k]:.3f}" for k in shown))
-    out = {}
-    for way, error in pose_errors(network, frames, limit).items():
-        mean, high = error.mean(axis=0), np.quantile(error, 0.9, axis=0)
-        cells = [f"{mean[k]:.3f}/{high[k]:.3f}" for k in (1, 0, 2)]
-        print(f"  {way:<16} {'   '.join(cells)}", flush=True)
-        out[way] = [mean.tolist(), high.tolist()]
-    return out
+@contextmanager
+def timed(weights: Path) -> Iterator[None]:
+    """Add the CPU time of the block, its processes included, to what went into weights."""
+    before = sum(os.times()[:4])
+    yield
+    minutes = minutes_of(weights) + (sum(os.times()[:4]) - before) / 60
+    weights.with_suffix(".cpu.json").write_text(json.dumps(minutes), encoding="utf-8")
 
 
-def main() -> None:
-    """Render (once), train four times, print."""
+def encoder_of(base: PaperConfig, options: argparse.Namespace) -> str | None:
+    """The weights that every variant starts from; None where none are asked for or cameras read."""
+    path: Path = options.data / "encoder.pt"
+    if base.needs_images or not options.encoder_steps:
+        return None
+    if not path.exists():
+        recipe = load_recipe(options.config, options.set)
+        with timed(path):
+            train_encoder(base, recipe, options.data / "train", path, options.encoder_steps)
+    return str(path)
+
+
+def trained(name: str, base: PaperConfig, start: str | None, options: argparse.Namespace) -> Path:
+    """The weights of a variant, trained as far as they were not yet."""
+    variant = VARIANTS[name]
+    config = replace(base, **variant.changes)
+    path: Path = options.data / f"{name.replace(' ', '-').replace(',', '')}.pt"
+    resume = path if path.exists() else None
+    if resume is not None and load_resumable(path, config)["step"] >= options.steps:
+        return path
+    request = TrainOptions(
+        data=(options.data / "train",),
+        output=path,
+        recipe=load_recipe(options.config, options.set),
+        steps=options.steps,
+        seed=variant.seed,
+        init=None if resume else start,
+        init_partial=True,
+        resume=resume,
+        quiet=True,
+    )
+    with timed(path):
+        result = train(config, request, device=options.device, workers=options.threads)
+    if result["progress"] < 1.0:
+        sys.exit(f"{name}: stopped at step {result['step']}; the same command goes on")
+    return path
+
+
+def row_of(readings: measured.Readings, found: measured.Figures) -> dict[str, Any]:
+    """The figures of one variant as JSON has them."""
+    names = (*measured.MAP_FIGURES, measured.EXISTENCE)
+    return {
+        "figures": {name: float(found[name][0]) for name in names},
+        "poses": {
+            way: [error.mean(axis=0).tolist(), np.quantile(error, 0.9, axis=0).tolist()]
+            for way, error in readings.poses.items()
+        },
+    }
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--config", default="rtmap-r18-small")
-    parser.add_argument("--steps", type=int, default=2000, help="per variant")
+    parser.add_argument("--config", default="rtmap-raster-small")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--steps", type=int, default=2200, help="per variant")
+    parser.add_argument("--encoder-steps", type=int, default=700, help="... all start from")
     parser.add_argument("--data", type=Path, required=True, help="frames and weights are kept here")
-    parser.add_argument("--frames", type=int, default=4000)
-    parser.add_argument("--test-frames", type=int, default=192)
+    parser.add_argument("--frames", type=int, default=3000)
+    parser.add_argument("--test-frames", type=int, default=384)
     parser.add_argument("--only", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     parser.add_argument("--threads", type=int, default=1, help="processes")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--json", type=Path, help="write the pose errors for paper_tables.py")
-    a = parser.parse_args()
-    base = load_config(a.config)
+    parser.add_argument("--json", type=Path, help="write the figures for paper_tables.py")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Render (once), train the variants, print."""
+    options = parse(arguments)
+    base = load_config(options.config)
     assert isinstance(base, PaperConfig)
-    generate(base, a.data / "train", a.frames, 1, a.threads, print)
-    generate(base, a.data / "test", a.test_frames, 900, a.threads, print)
-    test = Frames(a.data / "test", base)
-    errors = {}
-    for name in a.only:
-        config = replace(base, **VARIANTS[name])
-        path = a.data / f"{name.replace(' ', '-')}.pt"
-        options = TrainOptions(
-            data=(a.data / "train",),
-            output=path,
-            recipe=load_recipe(a.config),
-            steps=a.steps,
-            resume=path if path.exists() else None,
-            quiet=True,
-        )
-        train(config, options, device=a.device, workers=a.threads)
-        network, _ = load_network(path)
-        errors[name] = report(name, network, test, a.test_frames)
-    if a.json:
-        a.json.write_text(json.dumps(errors, indent=1), encoding="utf-8")
-    print("Columns of poses: lateral m, longitudinal m, yaw °; mean / 90 %.\n" + PAPER)
+    generate(base, options.data / "train", options.frames, TRAIN_SEED, options.threads, print)
+    generate(
+        base, options.data / "test", options.test_frames, TEST_SEED, options.threads, print,
+        per_town=TEST_PER_TOWN,
+    )  # fmt: skip
+    test = Frames(options.data / "test", base)
+    drawn = measured.resampled(measured.towns_of(test))
+    start = encoder_of(base, options)
+    rows: dict[str, dict[str, Any]] = {}
+    full: measured.Figures | None = None
+    for name in options.only:
+        weights = trained(name, base, start, options)
+        readings = measured.read(load_network(weights)[0], test)
+        found = measured.figures(readings, drawn)
+        full = found if name == FULL else full
+        rows[name] = row_of(readings, found) | {"cpu_minutes": round(minutes_of(weights), 1)}
+        if full is not None and name != FULL:
+            rows[name]["against full"] = measured.differences(found, full)
+        print(f"{name}: {rows[name]['figures']}", flush=True)
+    made = {
+        "config": options.config,
+        "steps": options.steps,
+        "encoder steps": 0 if start is None else options.encoder_steps,
+        "encoder CPU minutes": 0.0 if start is None else round(minutes_of(Path(start)), 1),
+        "batch": load_recipe(options.config, options.set).batch,
+        "frames": options.frames,
+        "test frames": len(test),
+        "test towns": len(test.order),
+    }
+    result = {"made": made, "variants": rows}
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1), encoding="utf-8")
+    print("\n".join(ablation_tables(result)))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,12 +38,14 @@ TABLE_4 = {
     "T^E": (0.142, 0.306, 0.589, 1.447, 0.521, 1.091),
     "T^R": (0.121, 0.257, 0.586, 1.429, 0.368, 0.799),
 }
-ABLATIONS = {
-    "full": TABLE_4["T^R"],
-    "without L_pose": (0.118, 0.242, 0.609, 1.507, 0.376, 0.841),
-    "without L_nll": (0.122, 0.261, 0.590, 1.436, 0.371, 0.800),
-    "without both": (0.122, 0.254, 0.618, 1.510, 0.390, 0.840),
+ABLATIONS = {  # by variant and way: without L_pose is its row "+ L_pts", without L_nll "+ L_pose"
+    ("full", "only Q_map"): "Tab. 4: .121 / .257, .586 / 1.429, .368 / .799",
+    ("full", "learned head"): "Tab. 4, T^E: .142 / .306, .589 / 1.447, .521 / 1.091",
+    ("full", "all of Q_prior"): "Tab. 3: .163 / .318, .686 / 1.616, .332 / .766",
+    ("without L_pose", "only Q_map"): "Tab. 4: .118 / .242, .609 / 1.507, .376 / .841",
+    ("without L_nll", "only Q_map"): "Tab. 4: .122 / .261, .590 / 1.436, .371 / .800",
 }
+"""The paper's rows beside ours; Tab. 3's "only Q_map" is .125 / .256, .633 / 1.530, .317 / .713."""
 POSES = ("lateral m", "longitudinal m", "yaw °")
 COLUMN = (1, 0, 2)
 """Where lateral, longitudinal and yaw stand in the errors."""
@@ -282,13 +284,54 @@ def table_4(found: Found | None, ablations: dict[str, Any] | None) -> list[str]:
             "`python benchmarks/paper_tables.py --tables 4 --ablations FILE`.",
             "",
         ]
-    rows = []
-    for name, ways in ablations.items():
-        for way, (mean, high) in ways.items():
+    return [*out, *ablation_tables(ablations)]
+
+
+def ablation_tables(ablations: dict[str, Any]) -> list[str]:
+    """What ``paper_ablations.py`` measured: figures, poses beside the paper's, differences."""
+    made, variants = ablations["made"], ablations["variants"]
+    names = list(next(iter(variants.values()))["figures"])
+    figures = [
+        [name, *(f"{row['figures'][k]:.3f}" for k in names), f"{row['cpu_minutes']:.1f}"]
+        for name, row in variants.items()
+    ]
+    poses: list[list[str]] = []
+    for name, row in variants.items():
+        for way, (mean, high) in row["poses"].items():
+            if way == "start" and poses:
+                continue  # the same frames and priors for all
             cells = [f"{mean[k]:.3f} / {high[k]:.3f}" for k in COLUMN]
-            paper = ABLATIONS.get(name) if way == "only Q_map" else None
-            rows.append([f"{name}, {way}", *cells, paper_cells(paper)])
-    return [*out, *markdown(["trained on simulated images", *POSES, "paper"], rows)]
+            title = way if way == "start" else f"{name}, {way}"
+            poses.append([title, *cells, ABLATIONS.get((name, way), "")])
+    told = (
+        "{config}: {steps} steps of {batch} out of {frames} frames, from an encoder of {encoder "
+        "steps} steps ({encoder CPU minutes} CPU minutes); {test frames} frames of {test towns} "
+        "other towns."
+    )
+    lines = [told.format_map(made), ""]
+    lines += markdown(["trained on simulated frames", *names, "CPU minutes"], figures)
+    lines += markdown(["mean / 90 %", *POSES, "paper (the same three)"], poses)
+    gaps = [
+        [f"{name}, {what}", *cells]
+        for name, row in variants.items()
+        for what, cells in _gaps(row.get("against full", {}), names)
+    ]
+    header = ["minus full [95 % over towns]", "value or lateral m", "longitudinal m", "yaw °"]
+    return [*lines, *(markdown(header, gaps) if gaps else [])]
+
+
+def _gaps(against: dict[str, list[float]], names: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
+    """Rows of the differences to the full variant; a star where the interval excludes zero."""
+    told = {
+        key: f"{gap:+.3f} [{low:+.3f}, {high:+.3f}]" + ("*" if low > 0 or high < 0 else "")
+        for key, (gap, low, high) in against.items()
+    }
+    for name in names:
+        if name in told and against[name] != [0.0, 0.0, 0.0]:
+            yield name, [told[name], "", ""]
+    for way in dict.fromkeys(key[:-2] for key in told if key not in names):
+        if way != "start":
+            yield way, [told[f"{way} {axis}"] for axis in COLUMN]
 
 
 DIFFERS = {

@@ -178,6 +178,23 @@ def test_ablations_are_read_or_said_not_to_be_there() -> None:
     lines = paper_print.table_4(None, None)
     assert any("not run" in line and "T^E" in line for line in lines)
     assert any("paper_ablations.py" in line for line in lines)
-    way = {"only Q_map": [[0.6, 0.1, 0.3], [1.2, 0.2, 0.6]]}
-    lines = paper_print.table_4(None, {"full": way})
-    assert any("0.100 / 0.200 | 0.600 / 1.200 | 0.300 / 0.600 | 0.121" in line for line in lines)
+    pose = [[0.6, 0.1, 0.3], [1.2, 0.2, 0.6]]
+    made = {"config": "c", "steps": 9, "encoder steps": 5, "batch": 4, "frames": 8}
+    row = {"figures": {"mAP": 0.25}, "cpu_minutes": 3.0, "poses": {"start": pose}}
+    gaps = {"mAP": [-0.1, -0.2, -0.05], "only Q_map 0": [0.1, -0.1, 0.3]}
+    gaps |= {f"only Q_map {k}": [0.2, 0.1, 0.3] for k in (1, 2)}
+    variants = {
+        "full": row | {"poses": {"start": pose, "only Q_map": pose}},
+        "without L_nll": row | {"against full": gaps},
+    }
+    made |= {"test frames": 16, "test towns": 2, "encoder CPU minutes": 1.5}
+    lines = paper_print.table_4(None, {"made": made, "variants": variants})
+    assert any("9 steps of 4 out of 8 frames" in line and "2 other towns" in line for line in lines)
+    assert "| without L_nll | 0.250 | 3.0 |" in lines
+    row_of_full = (
+        "| full, only Q_map | 0.100 / 0.200 | 0.600 / 1.200 | 0.300 / 0.600 | Tab. 4: .121"
+    )
+    assert any(line.startswith(row_of_full) for line in lines)
+    assert "| without L_nll, mAP | -0.100 [-0.200, -0.050]* |  |  |" in lines
+    told = "+0.200 [+0.100, +0.300]* | +0.100 [-0.100, +0.300] | +0.200 [+0.100, +0.300]* |"
+    assert f"| without L_nll, only Q_map | {told}" in lines

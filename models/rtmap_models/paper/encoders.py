@@ -115,4 +115,7 @@ class RasterEncoder(nn.Module):
     def forward(self, raster: Tensor) -> Encoded:
         """``raster`` float (B, raster_channels, 2 · rows, 2 · columns): rows go with +y, columns
         with +x, cells of ``cell_m``, values about 0 … 1."""
-        return Encoded(self.bev(self.stem(raster) + self.row + self.column), None)
+        features = self.stem(raster)
+        # One sum of the features' own type: bfloat16 stays what it is, and goes back once.
+        place = (self.row + self.column).to(features.dtype)
+        return Encoded(self.bev(features + place), None)

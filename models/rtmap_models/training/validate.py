@@ -49,14 +49,14 @@ def validate(
     chosen = np.unique(np.linspace(0, len(frames) - 1, limit).round().astype(int)).tolist()
     alone, aided, unchanged = (Scorer(config.classes, protocol="rtmap") for _ in range(3))
     exists: list[tuple[float, bool]] = []
-    for sample, found, _ in _readings(network, frames, chosen, None, bf16):
-        alone.add(found, _truth(sample, config))
-    for sample, found, _ in _readings(network, frames, chosen, NOISE, bf16):
+    for sample, found, _ in readings(network, frames, chosen, None, bf16):
+        alone.add(found, truth_of(sample, config))
+    for sample, found, _ in readings(network, frames, chosen, NOISE, bf16):
         assert sample.prior is not None
-        truth = _truth(sample, config)
+        truth = truth_of(sample, config)
         aided.add(found, truth)
-        unchanged.add(_named(sample.prior.points, sample.prior.classes, config), truth)
-    for sample, _, existence in _readings(network, frames, chosen, CHANGED, bf16):
+        unchanged.add(named(sample.prior.points, sample.prior.classes, config), truth)
+    for sample, _, existence in readings(network, frames, chosen, CHANGED, bf16):
         assert sample.prior is not None
         exists += zip(existence.tolist(), sample.prior.real.tolist(), strict=False)
     network.train(was_training)
@@ -69,7 +69,7 @@ def validate(
     } | {f"mAP {name}": score.mean for name, score in result.classes.items()}
 
 
-def _readings(
+def readings(
     network: Any, frames: Frames, chosen: list[int], noise: PriorNoise | None, bf16: bool
 ) -> Iterator[tuple[Sample, list[Detection], Floats]]:
     """Sample, detections and existence of its prior elements, for every chosen frame."""
@@ -86,7 +86,7 @@ def _readings(
         batch = collate(samples, config).to(device)
         scores, points, existence = _answers(network, batch, bf16)
         for b, sample in enumerate(samples):
-            yield sample, _detections(scores[b], points[b], config), existence[b]
+            yield sample, detections_of(scores[b], points[b], config), existence[b]
 
 
 def _answers(network: Any, batch: Batch, bf16: bool) -> tuple[Floats, Floats, Floats]:
@@ -100,7 +100,7 @@ def _answers(network: Any, batch: Batch, bf16: bool) -> tuple[Floats, Floats, Fl
     return scores, points, existence
 
 
-def _detections(scores: Floats, points: Floats, config: ModelConfig) -> list[Detection]:
+def detections_of(scores: Floats, points: Floats, config: ModelConfig) -> list[Detection]:
     best = scores.argmax(axis=1)
     return [
         (config.classes[c], p, float(s[c]))
@@ -109,13 +109,13 @@ def _detections(scores: Floats, points: Floats, config: ModelConfig) -> list[Det
     ]
 
 
-def _truth(sample: Sample, config: ModelConfig) -> list[Detection]:
+def truth_of(sample: Sample, config: ModelConfig) -> list[Detection]:
     """What evaluation asks for: also pieces of lines that training leaves out as too short."""
     pieces = clip(sample.scene, config, min_length=0.5)
-    return _named(pieces.points, pieces.classes, config)
+    return named(pieces.points, pieces.classes, config)
 
 
-def _named(points: Floats, classes: NDArray[np.int64], config: ModelConfig) -> list[Detection]:
+def named(points: Floats, classes: NDArray[np.int64], config: ModelConfig) -> list[Detection]:
     return [(config.classes[c], p, 1.0) for p, c in zip(points, classes, strict=True)]
 
 
