@@ -123,7 +123,11 @@ def place_amplitude(seen: Detections, linear: Linear, model: ErrorModel) -> Arra
 
 def _root(weight: Array, shared: Array) -> tuple[Array, Array]:
     """L⁻¹ (E, 2, 2) with L Lᵀ = A = I + Uᵀ W U, and log det A (E,)."""
-    a = np.swapaxes(shared, -1, -2) @ (shared * weight[..., None])
+    return woodbury_root(np.swapaxes(shared, -1, -2) @ (shared * weight[..., None]))
+
+
+def woodbury_root(a: Array) -> tuple[Array, Array]:
+    """L⁻¹ (E, 2, 2) with L Lᵀ = I + ``a``, and log det (E,) of that."""
     l00 = np.sqrt(a[..., 0, 0] + 1.0)
     l10 = a[..., 0, 1] / l00
     l11 = np.sqrt(np.maximum(a[..., 1, 1] + 1.0 - l10 * l10, 1e-12))
