@@ -32,7 +32,7 @@ class ErrorModel:
     # and the travel during which one error of it stays in range.
     map_sigma_m: float = 0.1
     map_length_m: float = 12.0
-    map_persist_m: float = 50.0
+    map_persist_m: float = 30.0
     # Constant error of the rig's calibration, which no drive can show.
     rig_sigma_m: float = 0.05
     rig_sigma_rad: float = 0.0005
@@ -65,18 +65,20 @@ class Settings:
     start_doubts_m: tuple[tuple[float, ...], tuple[float, ...]] = ((1.0, 0.5), (0.25, 0.1))
     finalists: int = 3
     # The same for the rounds with the field, and for those over the whole log.
-    gates_m: tuple[float, ...] = (1.0, 1.0, 1.0)
+    gates_m: tuple[float, ...] = (1.5, 1.5, 1.5)
     doubts_m: tuple[float, ...] = (0.1, 0.05, 0.0)
     smooth_gates_m: tuple[float, ...] = (3.0, 2.0, 1.5, 1.0, 1.0, 1.0)
     smooth_doubts_m: tuple[float, ...] = (0.3, 0.2, 0.1, 0.05, 0.0, 0.0)
     # Distance in association that two perpendicular lines have at the same place.
     heading_weight_m: float = 2.0
-    # Vertex residuals beyond this many sigmas count linearly.
-    huber: float = 1.0
+    # Vertex residuals beyond this many sigmas count linearly: in single frames, over the whole log.
+    huber: float = 0.5
+    smooth_huber: float = 1.0
     # Detections with a lower score are left out; the others' prior log-odds to be on the map are
-    # the logit of the score and this.
+    # the logit of the score and this. It doubts more than networks err, because stated sigmas
+    # scatter: an element that was 2 sigmas off at the stated one had a larger sigma.
     min_score: float = 0.05
-    score_logit: float = 1.5
+    score_logit: float = -1.0
     # What of a difference in evidence between starts is believed: elements are not independent.
     evidence_share: float = 0.5
     # A direction (yaw at a lever of 10 m) that the map leaves less certain than this is degenerate;

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,15 +39,27 @@ class Linear:
 @dataclass(frozen=True)
 class Noise:
     """The covariance W⁻¹ + U Uᵀ of each element: ``weight`` (E, V) = 1 / vertex variance, 0 where
-    nothing was found; ``shared`` (E, V, 2): what the element's common offset does (U)."""
+    nothing was found; ``normal`` (E, V, 2) in the ego frame; ``size`` (E, 2): standard deviation
+    of the element's common offset along ego x and y."""
 
     weight: Array
-    shared: Array
+    normal: Array
+    size: Array
 
-    def doubted(self, linear: Linear, doubt_m: float) -> Noise:
+    @cached_property
+    def shared(self) -> Array:
+        """(E, V, 2) what a unit value of the common offset does to the residuals (U)."""
+        return self.normal * self.size[:, None]
+
+    def doubted(self, doubt_m: float) -> Noise:
         """With ``doubt_m`` more on the common offset: the pose itself is not known better yet."""
-        size = np.hypot(self.shared, linear.normal * doubt_m)
-        return Noise(self.weight, np.copysign(size, linear.normal))
+        return Noise(self.weight, self.normal, np.hypot(self.size, doubt_m))
+
+
+def turn_of(seen: Detections, pose: Array) -> Array:
+    """(E, 2, 2) turns of the elements' frames at poses (T, 3): p @ turn = R p."""
+    c, s = np.cos(pose[seen.frame, 2]), np.sin(pose[seen.frame, 2])
+    return np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
 
 
 def linearize(
@@ -54,11 +67,10 @@ def linearize(
 ) -> Linear:
     """Associate every vertex at ``pose`` (T, 3) and differentiate n · (R p + t - q).
 
-    ``shift`` (E, V, 2), map axes, is added to the vertices when their lines are looked for: what
-    is known of their errors must not lead them to another line. Residuals are without it.
+    ``shift`` (E, V or 1, 2), map axes, is added to the vertices when their lines are looked for:
+    what is known of their errors must not lead them to another line. Residuals are without it.
     """
-    c, s = np.cos(pose[seen.frame, 2]), np.sin(pose[seen.frame, 2])
-    turn = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)  # p @ turn = R p
+    turn = turn_of(seen, pose)
     turned = seen.points @ turn
     at = turned + pose[seen.frame, None, :2]
     at = at if shift is None else at + shift
@@ -109,8 +121,8 @@ def noise_of(
     vertex = model.vertex_share * stated + variance * clump[:, None]
     map_common = together * (variance * found).sum(-1) / np.maximum(found.sum(-1), 1)
     common = np.reshape(offset_share, (-1, 1)) * (seen.common * model.scale) ** 2
-    shared = linear.normal * np.sqrt(common + map_common[:, None])[:, None]
-    return Noise(np.where(found, 1.0 / np.maximum(vertex, 1e-8), 0.0), shared)
+    weight = np.where(found, 1.0 / np.maximum(vertex, 1e-8), 0.0)
+    return Noise(weight, linear.normal, np.sqrt(common + map_common[:, None]))
 
 
 def place_amplitude(seen: Detections, linear: Linear, model: ErrorModel) -> Array:
@@ -162,13 +174,24 @@ def _explained(r: Array, weight: Array, shared: Array) -> tuple[Array, Array, Ar
     return offset, (b * b).sum((-1, -2)), logdet
 
 
+def common_offset(r: Array, weight: Array, noise: Noise) -> Array:
+    """(E, 2) likeliest common offset of each element in the ego frame (m), from residuals (E, V)
+    with robust weights (E, V): E[o | r] with r = n · o + v, o ~ N(0, diag size²)."""
+    inverse, _ = _root(weight, noise.shared)
+    b = inverse @ (np.swapaxes(noise.shared, -1, -2) @ (r * weight)[..., None])
+    offset: Array = noise.size * (np.swapaxes(inverse, -1, -2) @ b)[..., 0]
+    return offset
+
+
 @dataclass(frozen=True)
 class Judgement:
     """``vertex`` (E, V) Huber weights; ``inlier`` (E,) probability that an element is what the map
-    says it is; ``evidence`` (E,) log-likelihood of its residuals under the mixture of both."""
+    says it is; ``fits`` (E,): its residuals speak for that, whatever was thought before;
+    ``evidence`` (E,) log-likelihood of its residuals under the mixture of both."""
 
     vertex: Array
     inlier: Array
+    fits: NDArray[np.bool_]
     evidence: Array
 
     def weight(self, noise: Noise) -> Array:
@@ -200,5 +223,6 @@ def judge(
     # An element with no line near it at all: as an outlier with all its vertices would fare.
     vertex_variance = 0.5 * model.vertex_share * (seen.common**2).sum(-1) * model.scale**2
     lost = p_out - 0.5 * np.log1p(r.shape[1] * model.outlier_sigma_m**2 / vertex_variance)
+    fits = matched & (inside - outside > seen.logit)
     missing = (~linear.found).sum(-1) * _UNMATCHED
-    return Judgement(vertex, inlier, np.where(matched, either, lost) - missing)
+    return Judgement(vertex, inlier, fits, np.where(matched, either, lost) - missing)

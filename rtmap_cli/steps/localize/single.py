@@ -15,12 +15,14 @@ from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
 from rtmap_cli.steps.localize.residuals import (
     Linear,
+    common_offset,
     gram,
     gram_sum,
     judge,
     linearize,
     noise_of,
     place_amplitude,
+    turn_of,
 )
 
 Array = NDArray[np.float64]
@@ -158,7 +160,7 @@ def _start_step(
     gate, doubt = rule
     linear = linearize(lines, seen, pose, gate)
     noise = noise_of(lines, seen, linear, model, model.offset_share)
-    doubted = noise.doubted(linear, doubt)
+    doubted = noise.doubted(doubt)
     judgement = judge(seen, linear, doubted, linear.r, model, settings.huber)
     information, d = _prior(seen, pose)
     evidence: Array = seen.sum_by_frame(judgement.evidence) - 0.5 * (information * d * d).sum(1)
@@ -176,16 +178,25 @@ def _refine(
     model: ErrorModel,
     settings: Settings,
 ) -> Solution:
-    """Gauss–Newton with the field of place errors, which is eliminated class by class."""
+    """Gauss–Newton with the field of place errors, which is eliminated class by class.
+
+    After the first round lines are looked for where the elements are without their likely offsets:
+    the nearest line of an element that is off by half a lane width (or half a crossing) is
+    another one, and association to it would pull the pose along.
+    """
+    shift: Array | None = None
     for gate, doubt in zip(settings.gates_m, settings.doubts_m, strict=True):
-        linear = linearize(lines, seen, pose, gate)
-        whole = noise_of(lines, seen, linear, model, model.offset_share).doubted(linear, doubt)
+        linear = linearize(lines, seen, pose, gate, shift)
+        whole = noise_of(lines, seen, linear, model, model.offset_share).doubted(doubt)
         judgement = judge(seen, linear, whole, linear.r, model, settings.huber)
         noise = noise_of(lines, seen, linear, model, model.element_share)
         weight = judgement.weight(noise)
         g = _field_gram(seen, linear, weight, noise.shared, model)
-        pose, covariance = _solve(g, seen, pose)
-    used = seen.sum_by_frame(((weight > 0) & (judgement.inlier[:, None] > 0.5)).sum(-1))
+        before, (pose, covariance) = pose, _solve(g, seen, pose)
+        left = linear.r + (linear.jacobian @ (pose - before)[seen.frame, :, None])[..., 0]
+        offset = common_offset(left, judgement.weight(whole), whole)
+        shift = -offset[:, None] @ turn_of(seen, pose)
+    used = seen.sum_by_frame(((weight > 0) & judgement.fits[:, None]).sum(-1))
     return Solution(
         pose,
         covariance + spread,

@@ -60,8 +60,10 @@ def solve_smooth(
     for gate, doubt in zip(settings.smooth_gates_m, settings.smooth_doubts_m, strict=True):
         linear = linearize(lines, seen, pose, gate, shift)
         field = PlaceField(lines, seen, linear, chunk, model, field)
-        plain = noise_of(lines, seen, linear, model, shares.judged).doubted(linear, doubt)
-        judgement = judge(seen, linear, plain, linear.r + field.predict(), model, settings.huber)
+        plain = noise_of(lines, seen, linear, model, shares.judged).doubted(doubt)
+        judgement = judge(
+            seen, linear, plain, linear.r + field.predict(), model, settings.smooth_huber
+        )
         noise = noise_of(lines, seen, linear, model, shares.solved, map_repeats)
         weight, index = judgement.weight(noise), field.frame_index
         system, _, _ = _system(field, weight, noise, motion, pose, bias)
@@ -76,7 +78,7 @@ def solve_smooth(
     noise = noise_of(lines, seen, linear, model, shares.stated, map_repeats)
     weight = judgement.weight(noise)
     system, information, chi2 = _system(field, weight, noise, motion, pose, bias)
-    used = seen.sum_by_frame(((weight > 0) & (judgement.inlier[:, None] > 0.5)).sum(-1))
+    used = seen.sum_by_frame(((weight > 0) & judgement.fits[:, None]).sum(-1))
     covariance = _pose_blocks(system, chunk, index)
     spread = np.zeros_like(covariance)
     return Solution(pose, covariance, information, chi2, used.astype(np.int64), spread)
