@@ -21,7 +21,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -69,7 +69,7 @@ def problem(place: Place, kind: str, seed: int) -> Problem:
     linear = linearize(lines, seen, at, settings.gates_m[-1])
     noise = noise_of(lines, seen, linear, model, model.offset_share)
     judgement = judge(seen, linear, noise, linear.r, model, settings.huber)
-    return Problem(seen, linear, Noise(judgement.weight(noise), noise.shared), at)
+    return Problem(seen, linear, replace(noise, weight=judgement.weight(noise)), at)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from localize_scenes import drive, observed, run_of, town
 from scipy.optimize import least_squares
@@ -10,7 +12,7 @@ from rtmap_cli.steps.localize.frames import read_detections
 from rtmap_cli.steps.localize.held import solve_held
 from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.residuals import Noise, gram, judge, linearize, noise_of
+from rtmap_cli.steps.localize.residuals import gram, judge, linearize, noise_of
 from rtmap_cli.steps.localize.single import _solve
 
 MODEL, SETTINGS = ErrorModel(), Settings()
@@ -27,7 +29,7 @@ def _held():
     linear = linearize(lines, seen, at, 1.5)
     noise = noise_of(lines, seen, linear, MODEL, MODEL.offset_share)
     judgement = judge(seen, linear, noise, linear.r, MODEL, SETTINGS.huber)
-    return seen, linear, at, Noise(judgement.weight(noise), noise.shared)
+    return seen, linear, at, replace(noise, weight=judgement.weight(noise))
 
 
 def test_poses_are_those_of_scipy() -> None:
@@ -75,7 +77,7 @@ def test_a_frame_that_sees_nothing_stays_at_its_initial_pose() -> None:
     seen, linear, at, noise = _held()
     blind = seen.frame == 2
     poses, information = solve_held(
-        seen, linear, at, Noise(np.where(blind[:, None], 0.0, noise.weight), noise.shared)
+        seen, linear, at, replace(noise, weight=np.where(blind[:, None], 0.0, noise.weight))
     )
     assert np.allclose(poses[2], seen.pose[2], atol=1e-12)
     assert np.allclose(information[2], np.diag(seen.sigma[2] ** -2.0))
