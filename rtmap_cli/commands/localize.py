@@ -24,6 +24,12 @@ if TYPE_CHECKING:
 @options.map_version
 @click.option("--smooth", is_flag=True, help="Solve the whole log at once, with odometry.")
 @click.option(
+    "--lag",
+    type=options.FiniteRange(0),
+    metavar="SECONDS",
+    help="With --smooth: a frame's answer knows what is seen up to so much later, as live.",
+)
+@click.option(
     "--method",
     type=click.Choice(["auto", "matches", "geometry", "end-to-end"]),
     default="auto",
@@ -45,6 +51,7 @@ def command(
     map_path: Path,
     map_version: int | None,
     smooth: bool,
+    lag: float | None,
     method: str,
     search: tuple[float, float] | None,
     residuals: bool,
@@ -71,6 +78,8 @@ def command(
     check_same_crs(map_crs(map_path), str(read_run_info(run)["crs"]), map_path)
     loaded = read_run(run)
     reach = _reach(loaded, search, method)
+    if lag is not None:
+        _check_lag(smooth, method, reach, search is not None)
     box = bounds(loaded, reach) if len(loaded.frames) else None
     vector_map = read_map(map_path, map_version, box)
     if residuals and method == "end-to-end":
@@ -78,7 +87,7 @@ def command(
     why: list[Residuals] = []
     explain = why.append if residuals else None
     poses = localize(
-        loaded, vector_map, method, smooth, where=map_path, search=reach, explain=explain
+        loaded, vector_map, method, smooth, where=map_path, search=reach, explain=explain, lag=lag
     )
     replaced = loaded.poses is not None
     for rows in why:
@@ -93,6 +102,7 @@ def command(
         "log_id": loaded.log_id,
         "map_version": vector_map.version,
         "replaced": replaced,
+        "lag_s": lag,
         "search": reach and {"metres": reach.metres, "degrees": math.degrees(reach.radians)},
     }
     emit(result, as_json, _lines(result))
@@ -109,6 +119,14 @@ def _reach(run: Run, search: tuple[float, float] | None, method: str) -> Reach |
     if method == "end-to-end" or not len(run.frames) or not needs_search(run.frames.sigma):
         return None
     return reach_of(run.frames.sigma)
+
+
+def _check_lag(smooth: bool, method: str, reach: Reach | None, asked: bool) -> None:
+    if not smooth or method == "end-to-end":
+        raise UsageError("--lag needs --smooth, and detections to smooth")
+    if reach is not None:
+        why = "--search" if asked else "a search, which the sigmas of the initial poses ask for,"
+        raise UsageError(f"{why} looks at the whole log and cannot be had with --lag")
 
 
 def _doubt(run: Run, poses: Poses, vector_map: VectorMap, where: Path) -> str | None:
@@ -158,6 +176,8 @@ def _lines(result: dict[str, Any]) -> list[str]:
         if searched
         else ""
     )
+    if result["lag_s"] is not None:
+        how = f" of {result['lag_s']:g} s"
     told = ", ".join(f"{n} {s}" for s, n in result["status"].items() if n)
     sigma = result["median_sigma"]
     return [

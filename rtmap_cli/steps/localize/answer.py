@@ -15,6 +15,9 @@ Array = NDArray[np.float64]
 YAW_LEVER_M = 10.0
 """Yaw counts as metres at this distance where directions are compared."""
 
+WHOLE = ("smooth", "fixed-lag")
+"""Methods by which a frame is known from its neighbours too."""
+
 # What nothing here measures: height, roll and pitch of the initial pose (m, rad).
 _UNMEASURED = (1.0, 0.05, 0.05)
 
@@ -39,7 +42,7 @@ def poses_of(
     matched = solution.residuals >= settings.min_residuals
     weak = values[:, 0] < settings.degenerate_m**-2
     status = np.where(weak, "degenerate", "ok").astype(object)
-    if method == "smooth":
+    if method in WHOLE:
         # A frame between others is known from them even if it matched nothing itself.
         matched = np.full(len(frames), matched.any())
     status[~matched] = "no-match"
@@ -70,7 +73,7 @@ def lift(initial: Array, planar: Array, origin: Array) -> Array:
 
 
 def _information(frames: RunFrames, solution: Solution, method: str) -> Array:
-    if method != "smooth":
+    if method not in WHOLE:
         return solution.information
     gnss = np.zeros_like(solution.covariance)
     gnss[:, [0, 1, 2], [0, 1, 2]] = frames.sigma**-2

@@ -16,14 +16,15 @@ from rtmap_cli.logs.run import Poses, Run, RunFrames
 from rtmap_cli.maps.crs import check_same_crs
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.localize.answer import poses_of
-from rtmap_cli.steps.localize.calibrate import calibrated
+from rtmap_cli.steps.localize.begin import single_frames
 from rtmap_cli.steps.localize.explain import residuals_at
 from rtmap_cli.steps.localize.frames import has_matches, read_detections
 from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.live import solve_live
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
 from rtmap_cli.steps.localize.motion import motion_of
 from rtmap_cli.steps.localize.relocate import Found, Reach, moved, relocate, widened
-from rtmap_cli.steps.localize.single import Solution, solve_single
+from rtmap_cli.steps.localize.single import Solution
 from rtmap_cli.steps.localize.smooth import solve_smooth
 
 Array = NDArray[np.float64]
@@ -45,6 +46,7 @@ def localize(
     where: str | Path = "map",
     search: Reach | None = None,
     explain: Callable[[Residuals], None] | None = None,
+    lag: float | None = None,
 ) -> Poses:
     """Localize every frame of a run on a map (Eq. 4 of the paper; ``smooth``: all frames at once).
 
@@ -75,14 +77,13 @@ def localize(
         place = relocate(lines, seen, motion, search)
         gnss, seen = seen.pose, moved(seen, place)
     around = None if place is None else place.pose
-    start = solve_single(lines, seen, model or ErrorModel(), settings, start=around)
-    if model is None:
-        model = calibrated(lines, seen, start, ErrorModel(), settings)
-        # Other sigmas may choose another start; other shares of them only refine it.
-        found = start if model.scale == ErrorModel().scale else None
-        start = solve_single(lines, seen, model, settings, found, around)
     name = "matches" if matched else "geometry"
-    if smooth:
+    if lag is not None:
+        start, model = solve_live(lines, seen, run.frames, lag, model, settings)
+        name = "fixed-lag"
+    else:
+        start, model = single_frames(lines, seen, model, settings, around)
+    if smooth and lag is None:
         motion = motion_of(run.frames, gnss, model, settings)
         start = solve_smooth(lines, seen, motion, start, model, settings, around)
         name = "smooth"
@@ -123,7 +124,8 @@ def _lines(
     run: Run, vector_map: VectorMap, settings: Settings, where: str | Path
 ) -> tuple[MapLines, Array]:
     """The lines of the map around a run; BadInput when there are none."""
-    origin = np.round(run.frames.initial[:, :2, 3].mean(axis=0))
+    # The first frame's, which a live system knows too.
+    origin = np.round(run.frames.initial[0, :2, 3])
     lines = MapLines(vector_map, list(run.info["classes"]), origin, settings.heading_weight_m)
     box = bounds(run)
     if lines.count:
