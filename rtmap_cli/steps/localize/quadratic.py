@@ -157,14 +157,14 @@ def frame_terms(
         known = design @ bumps.weights[seen].ravel()
         rest[elements] += known.reshape(rest[elements].shape)
     shares = shares_of(some, spacing, model)
-    plain = noise_of(lines, some, linear, model, shares.judged).doubted(linear, rule[1])
+    plain = noise_of(lines, some, linear, model, shares.judged).doubted(rule[1])
     judgement = judge(some, linear, plain, rest, model, huber)
     solved, stated = (
         noise_of(lines, some, linear, model, share, shares.map_repeats)
         for share in (shares.solved, shares.stated)
     )
     weights = judgement.weight(solved), judgement.weight(stated)
-    used = some.sum_by_frame(((weights[1] > 0) & (judgement.inlier[:, None] > 0.5)).sum(-1))
+    used = some.sum_by_frame(((weights[1] > 0) & judgement.fits[:, None]).sum(-1))
     out = [
         FrameTerms([], linear.jacobian[a:b, :, :2], int(n), f.rounds + 1, p.copy())
         for a, b, n, f, p in zip(ends[:-1], ends[1:], used, before, pose, strict=True)

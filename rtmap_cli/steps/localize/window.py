@@ -156,8 +156,8 @@ class Window:
         rule = self.settings.start_gates_m[1][-1], self.settings.start_doubts_m[1][0]
         linear = linearize(self.lines, some, pose, rule[0])
         noise = noise_of(self.lines, some, linear, self.model, self.model.offset_share)
-        noise = noise.doubted(linear, rule[1])
-        told = judge(some, linear, noise, linear.r, self.model, self.settings.huber).evidence
+        noise = noise.doubted(rule[1])
+        told = judge(some, linear, noise, linear.r, self.model, self.settings.smooth_huber).evidence
         return self.settings.evidence_share * float(told.sum())
 
     def _arrive(self, last: int) -> None:
@@ -197,7 +197,7 @@ class Window:
                 self.chunk[frames],
                 self.bumps,
                 self.model,
-                self.settings.huber,
+                self.settings.smooth_huber,
             )
             self.frames |= dict(zip(rows, terms, strict=True))
         self.step(apply=True)
