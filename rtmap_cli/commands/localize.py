@@ -44,6 +44,13 @@ if TYPE_CHECKING:
     help="How far the initial poses may be off: the place is searched for first. By itself where "
     "they state sigmas above 2 m or 5°.",
 )
+@click.option(
+    "--ground-z",
+    type=options.FiniteRange(-5, 5),
+    metavar="METRES",
+    help="Height of the road in the ego frame, for maps with heights (default: what run.json or "
+    "the initial heights say).",
+)
 @click.option("--residuals", is_flag=True, help="Also write RUN/residuals.parquet: why.")
 @options.as_json
 def command(
@@ -54,6 +61,7 @@ def command(
     lag: float | None,
     method: str,
     search: tuple[float, float] | None,
+    ground_z: float | None,
     residuals: bool,
     as_json: bool,
 ) -> None:
@@ -87,7 +95,15 @@ def command(
     why: list[Residuals] = []
     explain = why.append if residuals else None
     poses = localize(
-        loaded, vector_map, method, smooth, where=map_path, search=reach, explain=explain, lag=lag
+        loaded,
+        vector_map,
+        method,
+        smooth,
+        where=map_path,
+        search=reach,
+        explain=explain,
+        lag=lag,
+        ground_z=ground_z,
     )
     replaced = loaded.poses is not None
     for rows in why:

@@ -19,6 +19,7 @@ from rtmap_cli.steps.localize.answer import poses_of
 from rtmap_cli.steps.localize.begin import single_frames
 from rtmap_cli.steps.localize.explain import residuals_at
 from rtmap_cli.steps.localize.frames import has_matches, read_detections
+from rtmap_cli.steps.localize.heights import with_heights
 from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.live import solve_live
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
@@ -47,6 +48,7 @@ def localize(
     search: Reach | None = None,
     explain: Callable[[Residuals], None] | None = None,
     lag: float | None = None,
+    ground_z: float | None = None,
 ) -> Poses:
     """Localize every frame of a run on a map (Eq. 4 of the paper; ``smooth``: all frames at once).
 
@@ -90,6 +92,10 @@ def localize(
     if place is not None:
         start = widened(start, place)
     poses = poses_of(run.frames, start, origin, name, model, settings)
+    ground = run.info.get("ground_z") if ground_z is None else ground_z
+    time = run.frames.timestamp_ns
+    live = lag is not None and lag * 1e9 < time[-1] - time[0]
+    poses = with_heights(poses, run.frames.initial, vector_map, ground, live)
     if (poses.status == "no-match").all():
         raise NoAnswer(f"{run.log_id}: nothing in any frame matches the map")
     if explain is not None:
