@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cholesky, solve_triangular
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -24,8 +24,9 @@ class BlockSystem:
         self.diagonal = [np.zeros((n, n)) for n in sizes]
         self.lower = [np.zeros((b, a)) for a, b in pairwise(sizes)]
         self.gradient = np.zeros(int(self.offset[-1]))
-        self.factors: list[tuple[Array, bool]] = []
-        self.gains: list[Array] = []
+        # H = L Lᵀ: the diagonal blocks of L, and those below them.
+        self.roots: list[Array] = []
+        self.ties: list[Array] = []
 
     def chunk_of(self, index: Index) -> Index:
         """Chunk of each unknown."""
@@ -37,11 +38,11 @@ class BlockSystem:
         first = int(self.chunk_of(index[:1])[0])
         split = int(np.searchsorted(index, self.offset[first + 1]))
         a = index[:split] - self.offset[first]
-        self.diagonal[first][np.ix_(a, a)] += information[:split, :split]
+        self.diagonal[first][a[:, None], a] += information[:split, :split]
         if split < len(index):
             b = index[split:] - self.offset[first + 1]
-            self.diagonal[first + 1][np.ix_(b, b)] += information[split:, split:]
-            self.lower[first][np.ix_(b, a)] += information[split:, :split]
+            self.diagonal[first + 1][b[:, None], b] += information[split:, split:]
+            self.lower[first][b[:, None], a] += information[split:, :split]
 
     def add_chain(self, first: Index, own: Array, below: Array, gradient: Array) -> None:
         """Add n factors in a row, each of k unknowns from ``first`` (n,) on: ``own`` (n, k, k),
@@ -70,35 +71,47 @@ class BlockSystem:
 
     def factor(self) -> None:
         """Eliminate chunk after chunk (block Cholesky)."""
-        self.factors, self.gains = [], []
+        self.roots, self.ties = [], []
         for b, d in enumerate(self.diagonal):
             if b:
-                d = d - self.lower[b - 1] @ self.gains[b - 1].T
-            f = cho_factor(d, lower=True, check_finite=False)
-            self.factors.append(f)
+                d = d - self.ties[-1] @ self.ties[-1].T
+            self.roots.append(cholesky(d, lower=True, check_finite=False))
             if b < len(self.lower):
-                self.gains.append(cho_solve(f, self.lower[b].T, check_finite=False).T)
+                self.ties.append(_forward(self.roots[-1], self.lower[b].T).T)
 
     def solve(self) -> Array:
         """The step -H⁻¹ g (after ``factor``)."""
         o = self.offset
         parts = [-self.gradient[o[b] : o[b + 1]] for b in range(len(self.diagonal))]
-        for b in range(1, len(parts)):
-            parts[b] = parts[b] - self.gains[b - 1] @ parts[b - 1]
+        for b, root in enumerate(self.roots):
+            if b:
+                parts[b] = parts[b] - self.ties[b - 1] @ parts[b - 1]
+            parts[b] = _forward(root, parts[b])
         for b in range(len(parts) - 1, -1, -1):
-            parts[b] = cho_solve(self.factors[b], parts[b], check_finite=False)
-            if b < len(self.gains):
-                parts[b] = parts[b] - self.gains[b].T @ parts[b + 1]
+            if b < len(self.ties):
+                parts[b] = parts[b] - self.ties[b].T @ parts[b + 1]
+            parts[b] = _backward(self.roots[b], parts[b])
         return np.concatenate(parts)
 
     def marginals(self) -> list[Array]:
         """The diagonal blocks of H⁻¹, one per chunk (after ``factor``)."""
         out: list[Array] = []
-        for b in range(len(self.factors) - 1, -1, -1):
-            n = len(self.diagonal[b])
-            block = cho_solve(self.factors[b], np.eye(n), check_finite=False)
+        for b in range(len(self.roots) - 1, -1, -1):
+            inverse = _forward(self.roots[b], np.eye(len(self.roots[b])))
+            block = inverse.T @ inverse
             if out:
-                gain = self.gains[b]
+                gain = self.ties[b] @ inverse
                 block = block + gain.T @ out[-1] @ gain
             out.append(block)
         return out[::-1]
+
+
+def _forward(root: Array, b: Array) -> Array:
+    """L⁻¹ b with L lower."""
+    return np.asarray(solve_triangular(root, b, lower=True, check_finite=False), np.float64)
+
+
+def _backward(root: Array, b: Array) -> Array:
+    """L⁻ᵀ b with L lower."""
+    out = solve_triangular(root, b, lower=True, trans="T", check_finite=False)
+    return np.asarray(out, np.float64)

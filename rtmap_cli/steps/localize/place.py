@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ _HALF = 1 << 24
 
 @dataclass(frozen=True)
 class _Group:
-    """Elements of one class in one frame: the bumps they see and (n V, m) values of these."""
+    """Elements of one class in one frame: the bumps they see, ascending, and (n V, m) values."""
 
     frame: int
     elements: slice
@@ -38,6 +39,8 @@ class PlaceField:
     Frames come in chunks of travel longer than the view, and a bump seen again two chunks later
     is a new one, so that unknowns only couple neighbouring chunks (a place that a drive comes back
     to is thus taken as independent). Weights survive when a later round meets other bumps.
+
+    ``index`` (bumps,), ``frame_index`` (T,): first unknown of each; ``sizes`` of the chunks.
     """
 
     def __init__(
@@ -51,51 +54,69 @@ class PlaceField:
     ) -> None:
         self.seen, self.linear = seen, linear
         self.amplitude = place_amplitude(seen, linear, model)
-        self.keys: dict[tuple[int, int], int] = {}
-        self.groups = self._group(lines, chunk, GridField(model.place_length_m))
-        born = np.array([b for _, b in self.keys], np.int64)
-        self.weights = np.zeros((len(self.keys), 2))
-        for key, k in self.keys.items():
-            if before is not None and key in before.keys:
-                self.weights[k] = before.weights[before.keys[key]]
-        self.sizes: list[int] = []
-        self.index = np.empty(len(born), np.int64)
-        self.frame_index = np.empty(len(chunk), np.int64)
-        first = 0
-        for b in range(int(chunk[-1]) + 1):
-            bumps, frames = np.flatnonzero(born == b), np.flatnonzero(chunk == b)
-            self.index[bumps] = first + 2 * np.arange(len(bumps))
-            self.frame_index[frames] = first + 2 * len(bumps) + STATE * np.arange(len(frames))
-            self.sizes.append(2 * len(bumps) + STATE * len(frames))
-            first += self.sizes[-1]
+        self.groups, names, born = self._group(lines, chunk, GridField(model.place_length_m))
+        self.keys = dict(zip(zip(names.tolist(), born.tolist(), strict=True), count()))
+        self.weights = np.zeros((len(names), 2))
+        if before is not None:
+            old = np.array([before.keys.get(key, -1) for key in self.keys], np.int64)
+            self.weights[old >= 0] = before.weights[old[old >= 0]]
+        chunks = int(chunk[-1]) + 1
+        bumps, frames = np.bincount(born, minlength=chunks), np.bincount(chunk, minlength=chunks)
+        sizes = 2 * bumps + STATE * frames
+        first = np.cumsum(sizes) - sizes
+        self.sizes: list[int] = sizes.tolist()
+        self.index: Index = first[born] + 2 * _number(born, bumps)
+        self.frame_index: Index = (first + 2 * bumps)[chunk] + STATE * _number(chunk, frames)
 
-    def _group(self, lines: MapLines, chunk: Index, field: GridField) -> list[_Group]:
-        count = self.seen.points.shape[1]
-        found = self.linear.found.ravel()
-        at = lines.xy[self.linear.sample.ravel()]
-        cells, values = field.basis(at)
-        code = np.repeat(self.seen.code, count)[:, None]
-        key = (code * 2 * _HALF + cells[..., 0] + _HALF) * 2 * _HALF + cells[..., 1] + _HALF
+    def _group(
+        self, lines: MapLines, chunk: Index, field: GridField
+    ) -> tuple[list[_Group], Index, Index]:
+        """What every group sees; names (bumps,) of cell and class, and the chunk they are born in.
+
+        Cells of a group are first numbered in the box of all, and those that no vertex sees are
+        left out then.
+        """
+        groups, per = self.seen.groups(), self.seen.points.shape[1]
+        sizes = np.array([e.stop - e.start for _, _, e in groups], np.int64)
+        frame = np.array([t for t, _, _ in groups], np.int64)
+        group = np.repeat(np.arange(len(groups)), sizes * per)
+        rows = np.flatnonzero(self.linear.found)
+        cells, values = field.basis(lines.xy[self.linear.sample.ravel()[rows]])
+        group_of = group[rows]
+        low, high = np.zeros((len(groups), 2), np.int64), np.full((len(groups), 2), -1)
+        first = np.flatnonzero(np.diff(group_of, prepend=-1))
+        if len(first):
+            low[group_of[first]] = np.minimum.reduceat(cells[:, 0], first)
+            high[group_of[first]] = np.maximum.reduceat(cells[:, -1], first)
+        box = high - low + 1
+        area = box.prod(1)
+        start = np.cumsum(area) - area
+        local = cells - low[group_of, None]
+        slot = start[group_of, None] + local[..., 0] * box[group_of, None, 1] + local[..., 1]
+        used = np.zeros(int(area.sum()), bool)
+        used[slot] = True
+        name = np.empty(len(used), np.int64)
+        code = self.seen.code[rows // per, None]
+        name[slot] = (code * 2 * _HALF + cells[..., 0] + _HALF) * 2 * _HALF + cells[..., 1] + _HALF
+        owner = np.repeat(np.arange(len(groups)), area)[used]
+        bump, names, born = _births(name[used], chunk[frame[owner]])
+        order = np.lexsort((bump, owner))
+        many = np.bincount(owner, minlength=len(groups))
+        ends = np.cumsum(many)
+        column = np.empty(len(used), np.int64)
+        column[np.flatnonzero(used)[order]] = _number(owner, many)
+        place = np.cumsum(sizes * per * many) - sizes * per * many
+        basis = np.zeros(int((sizes * per * many).sum()))
+        row = rows - ((np.cumsum(sizes) - sizes) * per)[group_of]
+        basis[(place[group_of] + row * many[group_of])[:, None] + column[slot]] = values
+        bump = bump[order]
         out = []
-        for t, _, elements in self.seen.groups():
-            rows = slice(elements.start * count, elements.stop * count)
-            here = np.flatnonzero(found[rows])
-            if not len(here):
-                continue
-            names, inverse = np.unique(key[rows][here], return_inverse=True)
-            basis = np.zeros((rows.stop - rows.start, len(names)))
-            basis[here[:, None], inverse.reshape(len(here), -1)] = values[rows][here]
-            bumps = np.array([self._bump(k, int(chunk[t])) for k in names.tolist()], np.int64)
-            out.append(_Group(t, elements, bumps, basis))
-        return out
-
-    def _bump(self, key: int, chunk: int) -> int:
-        got = self.keys.get((key, chunk))
-        if got is None:
-            got = self.keys.get((key, chunk - 1))
-        if got is None:
-            got = self.keys[(key, chunk)] = len(self.keys)
-        return got
+        for k in np.flatnonzero(many):
+            t, _, elements = groups[k]
+            shape = (sizes[k] * per, many[k])
+            values = basis[place[k] : place[k] + shape[0] * shape[1]].reshape(shape)
+            out.append(_Group(t, elements, bump[ends[k] - many[k] : ends[k]], values))
+        return out, names, born
 
     def predict(self) -> Array:
         """(E, V) what the field explains of the residuals, with the sign of a residual to add."""
@@ -113,17 +134,21 @@ class PlaceField:
         frames = len(self.seen)
         information, chi2 = np.zeros((frames, 3, 3)), np.zeros(frames)
         for g in self.groups:
-            e = g.elements
-            r, j = self.linear.r[e], self.linear.jacobian[e]
-            field = self.amplitude[e][:, :, None] * g.basis.reshape(*r.shape, -1, 1)
-            field = field.reshape(*r.shape, -1)
-            w = self.weights[g.bumps].ravel()
-            rest = (r + field @ w)[..., None]
-            matrix = gram_sum(np.concatenate([field, j, rest], -1), weight[e], shared[e])
-            bumps = (self.index[g.bumps][:, None] + (0, 1)).ravel()
-            index = np.concatenate([bumps, self.frame_index[g.frame] + np.arange(3)])
-            order = np.argsort(index)
-            system.add(index[order], matrix[:-1, :-1][np.ix_(order, order)], matrix[order, -1])
+            e, size = g.elements, 2 * len(g.bumps)
+            r, amplitude = self.linear.r[e], self.amplitude[e]
+            basis = g.basis.reshape(*r.shape, -1)
+            columns = np.empty((*r.shape, size + 4))
+            np.multiply(basis, amplitude[..., :1], out=columns[..., 0:size:2])
+            np.multiply(basis, amplitude[..., 1:], out=columns[..., 1:size:2])
+            columns[..., size:-1] = self.linear.jacobian[e]
+            columns[..., -1] = r + columns[..., :size] @ self.weights[g.bumps].ravel()
+            matrix = gram_sum(columns, weight[e], shared[e])
+            # Bumps come in the order of their unknowns, and before those of the frame.
+            index = np.empty(size + 3, np.int64)
+            index[0:size:2] = self.index[g.bumps]
+            index[1:size:2] = index[0:size:2] + 1
+            index[size:] = self.frame_index[g.frame] + np.arange(3)
+            system.add(index, matrix[:-1, :-1], matrix[:-1, -1])
             information[g.frame] += matrix[-4:-1, -4:-1]
             chi2[g.frame] += matrix[-1, -1]
         own = (self.index[:, None] + (0, 1)).ravel()
@@ -133,3 +158,32 @@ class PlaceField:
     def update(self, step: Array) -> None:
         """Apply the solver's step."""
         self.weights = self.weights + step[self.index[:, None] + np.arange(2)]
+
+
+def _number(kind: Index, counts: Index) -> Index:
+    """(n,) the how-manyth of its kind each is; ``kind`` (n,) ascends, ``counts`` of each."""
+    return np.arange(len(kind)) - (np.cumsum(counts) - counts)[kind]
+
+
+def _births(name: Index, chunk: Index) -> tuple[Index, Index, Index]:
+    """Which bump (n,) is meant where a ``name`` (n,) is seen in a ``chunk`` (n,); names (bumps,)
+    and chunks (bumps,) of the bumps, sorted by chunk.
+
+    A bump serves the chunk in which it is born and the next one.
+    """
+    order = np.lexsort((chunk, name))
+    n, c = name[order], chunk[order]
+    other = np.diff(n, prepend=-1) != 0
+    new = other | (np.diff(c, prepend=-1) != 0)
+    pair = np.cumsum(new) - 1
+    n, c, other = n[new], c[new], other[new]
+    broken = other | (np.diff(c, prepend=-1) != 1)
+    at = np.arange(len(n))
+    old = (at - np.maximum.accumulate(np.where(broken, at, 0))) % 2 == 1
+    sort = np.lexsort((n[~old], c[~old]))
+    bump = np.empty(len(n), np.int64)
+    bump[at[~old][sort]] = np.arange(len(sort))
+    bump[old] = bump[at[old] - 1]
+    out = np.empty(len(name), np.int64)
+    out[order] = bump[pair]
+    return out, n[~old][sort], c[~old][sort]
