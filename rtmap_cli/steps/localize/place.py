@@ -81,13 +81,14 @@ class PlaceField:
         frame = np.array([t for t, _, _ in groups], np.int64)
         group = np.repeat(np.arange(len(groups)), sizes * per)
         rows = np.flatnonzero(self.linear.found)
+        if not len(rows):
+            return [], np.empty(0, np.int64), np.empty(0, np.int64)
         cells, values = field.basis(lines.xy[self.linear.sample.ravel()[rows]])
         group_of = group[rows]
         low, high = np.zeros((len(groups), 2), np.int64), np.full((len(groups), 2), -1)
         first = np.flatnonzero(np.diff(group_of, prepend=-1))
-        if len(first):
-            low[group_of[first]] = np.minimum.reduceat(cells[:, 0], first)
-            high[group_of[first]] = np.maximum.reduceat(cells[:, -1], first)
+        low[group_of[first]] = np.minimum.reduceat(cells[:, 0], first)
+        high[group_of[first]] = np.maximum.reduceat(cells[:, -1], first)
         box = high - low + 1
         area = box.prod(1)
         start = np.cumsum(area) - area
