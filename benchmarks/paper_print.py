@@ -264,6 +264,9 @@ def claims_3(found: Found) -> list[Claim]:
     out = []
     for how in ("a frame alone", "whole drive"):
         out += _worse(found, f"Q_prior, {how}", f"Q_map, {how}", "outdated prior")
+        blind = f"Q_map without covariance, {how}"
+        if any(blind in result for _, result in found):
+            out += _worse(found, blind, f"Q_map, {how}", "ablation")
     return out
 
 

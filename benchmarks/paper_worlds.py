@@ -288,11 +288,15 @@ def keep_classes(path: Path, classes: set[str]) -> None:
 # ---- localization
 
 
+NO_SIGMA, BLIND = "Q_map without covariance", ("--without-sigma",)
+
+
 def localized_on(
     place: Place, kind: str, world_seed: int, seed: int, work: Path, specs: Sequence[ChangeSpec]
 ) -> dict[str, Any]:
     """Tab. 3: pose errors (n, 3: longitudinal m, lateral m, yaw °) on an outdated map, by who
-    takes part: all answers to prior queries (Q_prior), or those that still exist (Q_map)."""
+    takes part: all answers to prior queries (Q_prior), or those that still exist (Q_map), the
+    latter also without their covariances."""
     old, changes, keys = outdated(place, kind, world_seed, seed, specs, 2)
     prior = degrade_map(old, 0.1, seed)
     write_new_map(prior, work / "prior", "outdated")
@@ -301,9 +305,11 @@ def localized_on(
         d = drive_through(place, kind, key, work / "runs" / f"{n:02d}", prior)
         blind = credulous(read_run(d.run), work / "blind" / f"{n:02d}")
         out.setdefault("GNSS", []).extend(errors_of(d.run, d.drive.pose, initial=True))
-        for name, run in (("Q_prior", blind), ("Q_map", d.run)):
+        ways = (("Q_prior", blind, ()), ("Q_map", d.run, ()), (NO_SIGMA, d.run, BLIND))
+        for name, run, extra in ways:
             for how, flags in (("a frame alone", ()), ("whole drive", ("--smooth",))):
-                command("localize", run, "--map", work / "prior", "--method", "matches", *flags)
+                words = (run, "--map", work / "prior", "--method", "matches", *flags, *extra)
+                command("localize", *words)
                 errors = errors_of(run, d.drive.pose)
                 out.setdefault(f"{name}, {how}", []).extend(errors)
     return out

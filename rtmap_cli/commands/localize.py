@@ -38,6 +38,27 @@ if TYPE_CHECKING:
     "that the network gave. auto: matches where the run has any.",
 )
 @click.option(
+    "--prior",
+    type=click.Choice(["initial", "end-to-end", "both"]),
+    default="initial",
+    show_default=True,
+    help="What the solve leans on: the initial pose, the pose that the network gave with its "
+    "covariance (which counts the same detections twice), or both.",
+)
+@click.option(
+    "--start",
+    type=click.Choice(["initial", "end-to-end"]),
+    default="initial",
+    show_default=True,
+    help="Where the solve begins. The network's pose as a start counts nothing twice.",
+)
+@click.option("--with-outdated", is_flag=True, help="Ablation: nothing is outdated (Q_prior).")
+@click.option(
+    "--without-sigma",
+    is_flag=True,
+    help="Ablation: without covariances, all detections have the same sigma.",
+)
+@click.option(
     "--search",
     type=(click.FloatRange(0, 40), click.FloatRange(0, 180)),
     metavar="METRES DEGREES",
@@ -60,6 +81,10 @@ def command(
     smooth: bool,
     lag: float | None,
     method: str,
+    prior: str,
+    start: str,
+    with_outdated: bool,
+    without_sigma: bool,
     search: tuple[float, float] | None,
     ground_z: float | None,
     residuals: bool,
@@ -80,6 +105,7 @@ def command(
     from rtmap_cli.maps.crs import check_same_crs
     from rtmap_cli.maps.store import map_crs, read_map
     from rtmap_cli.output import emit, log
+    from rtmap_cli.steps.localize import given
     from rtmap_cli.steps.localize.localize import bounds, localize
 
     # The CRS first: a box in one CRS cannot ask a map in another.
@@ -92,11 +118,20 @@ def command(
     vector_map = read_map(map_path, map_version, box)
     if residuals and method == "end-to-end":
         raise UsageError("--residuals has no use for --method end-to-end")
+    if (prior, start) != ("initial", "initial") and (method == "end-to-end" or reach is not None):
+        raise UsageError(
+            "--prior and --start have no use for --method end-to-end, nor for a search"
+        )
+    asked, known = loaded, vector_map
+    if with_outdated:
+        asked = given.credulous(asked)
+    if without_sigma:
+        asked, known = given.without_sigma(asked, known)
     why: list[Residuals] = []
     explain = why.append if residuals else None
     poses = localize(
-        loaded,
-        vector_map,
+        asked,
+        known,
         method,
         smooth,
         where=map_path,
@@ -104,6 +139,8 @@ def command(
         explain=explain,
         lag=lag,
         ground_z=ground_z,
+        prior=prior,
+        begin=start,
     )
     replaced = loaded.poses is not None
     for rows in why:
@@ -119,6 +156,9 @@ def command(
         "map_version": vector_map.version,
         "replaced": replaced,
         "lag_s": lag,
+        "prior": prior,
+        "start": start,
+        "ablation": {"with_outdated": with_outdated, "without_sigma": without_sigma},
         "search": reach and {"metres": reach.metres, "degrees": math.degrees(reach.radians)},
     }
     emit(result, as_json, _lines(result))

@@ -40,26 +40,30 @@ def solve_live(
     lag_s: float,
     model: ErrorModel | None,
     settings: Settings,
+    around: Array | None = None,
 ) -> tuple[Solution, ErrorModel]:
     """Every frame from detections, odometry and GNSS up to ``lag_s`` seconds after it.
 
     So are the noise of GNSS and the error model, unless a ``model`` is given; the last one comes
     back. The frames within the lag of the first one are solved as ``solve_smooth`` does.
+    ``around`` (T, 3): where to begin, if not at the initial poses.
     """
     time = frames.timestamp_ns
     until = np.searchsorted(time, time + round(lag_s * 1e9), side="right") - 1
     stages = _stages(int(until[0]) + 1, len(frames))
-    single, now = single_frames(lines, seen.between(0, stages[0]), model, settings)
+    first = None if around is None else around[: stages[0]]
+    single, now = single_frames(lines, seen.between(0, stages[0]), model, settings, first)
     motion = motion_of(frames, seen.pose, now, settings, stages[0])
     window = Window(lines, seen, motion, now, settings)
-    window.begin(stages[0] - 1, single)
+    window.begin(stages[0] - 1, single, first)
     parts = [_widened(window.answers(_answered(until, stages[0] - 1)), single, stages[0])]
     for known, after in pairwise(stages):
         if known > stages[0]:
             now = model or calibrated(lines, seen.between(0, known), single, _DEFAULT, settings)
             window.model = now
             window.motion = motion_of(frames, seen.pose, now, settings, known)
-        more = solve_single(lines, seen.between(known, after), now, settings)
+        start = None if around is None else around[known:after]
+        more = solve_single(lines, seen.between(known, after), now, settings, start=start)
         single = joined([single, more])
         for t in range(known, after):
             window.follow(_ROUNDS)

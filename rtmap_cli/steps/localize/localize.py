@@ -19,6 +19,7 @@ from rtmap_cli.steps.localize.answer import poses_of
 from rtmap_cli.steps.localize.begin import single_frames
 from rtmap_cli.steps.localize.explain import residuals_at
 from rtmap_cli.steps.localize.frames import has_matches, read_detections
+from rtmap_cli.steps.localize.given import Rest, known_end_to_end, start_of, with_prior
 from rtmap_cli.steps.localize.heights import with_heights
 from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.live import solve_live
@@ -49,14 +50,19 @@ def localize(
     explain: Callable[[Residuals], None] | None = None,
     lag: float | None = None,
     ground_z: float | None = None,
+    prior: str = "initial",
+    begin: str = "initial",
 ) -> Poses:
     """Localize every frame of a run on a map (Eq. 4 of the paper; ``smooth``: all frames at once).
 
     ``method`` is one of METHODS. ``search``: how far the initial poses may be off, where that is
     more than the solver reaches by itself; their sigmas are then taken as half of it at least.
-    ``explain`` is called with the residuals at the poses. BadInput when the map has another CRS or
-    lies elsewhere, or when initial poses or sigmas are unusable; NoAnswer when no frame has an
-    answer.
+    ``explain`` is called with the residuals at the poses. ``lag``: seconds after which a smoothed
+    frame must be answered; ``ground_z``: height of the road in the ego frame (m), else the run's.
+    ``prior`` (PRIORS) and ``begin`` (STARTS): what the solve leans on and where it begins.
+
+    BadInput when the map has another CRS or lies elsewhere, or when initial poses or sigmas are
+    unusable; NoAnswer when no frame has an answer.
     """
     settings = settings or Settings()
     check_same_crs(vector_map.crs, run.crs, where)
@@ -66,6 +72,9 @@ def localize(
         return _end_to_end(run, origin, smooth, settings)
     if method == "matches" and not has_matches(run):
         raise UsageError("--method matches: the run has no matched elements; use geometry")
+    rest: Rest | None = None
+    if prior != "initial":
+        run, rest = with_prior(run, prior)
     if search is not None:
         run = replace(run, frames=_doubted(run.frames, search))
     matched = method == "matches" or (method == "auto" and has_matches(run))
@@ -79,9 +88,11 @@ def localize(
         place = relocate(lines, seen, motion, search)
         gnss, seen = seen.pose, moved(seen, place)
     around = None if place is None else place.pose
+    if begin == "end-to-end":
+        around = start_of(run, origin)
     name = "matches" if matched else "geometry"
     if lag is not None:
-        start, model = solve_live(lines, seen, run.frames, lag, model, settings)
+        start, model = solve_live(lines, seen, run.frames, lag, model, settings, around)
         name = "fixed-lag"
     else:
         start, model = single_frames(lines, seen, model, settings, around)
@@ -89,6 +100,8 @@ def localize(
         motion = motion_of(run.frames, gnss, model, settings)
         start = solve_smooth(lines, seen, motion, start, model, settings, around)
         name = "smooth"
+    elif rest is not None and lag is None:
+        start = rest.joined(start, origin)
     if place is not None:
         start = widened(start, place)
     poses = poses_of(run.frames, start, origin, name, model, settings)
@@ -152,9 +165,7 @@ def _end_to_end(run: Run, origin: Array, smooth: bool, settings: Settings) -> Po
     if smooth:
         raise UsageError("--method end-to-end takes T^E as it is and cannot be smoothed")
     pose, covariance = run.frames.end_to_end.copy(), run.frames.end_to_end_covariance
-    known = np.asarray(np.isfinite(pose).all(1) & np.isfinite(covariance).all((1, 2)))
-    if not known.any():
-        raise NoAnswer(f"{run.log_id}: the run has no end-to-end poses")
+    known = known_end_to_end(run)
     initial = xyyaw_of(run.frames.initial)
     pose = np.where(known[:, None], pose, initial)
     prior = run.frames.sigma[:, :, None] ** 2 * np.eye(3)

@@ -103,11 +103,12 @@ class Window:
 
     # ---- frames come
 
-    def begin(self, last: int, single: Solution) -> None:
-        """Frames 0 to ``last`` at once, from the answers of each frame alone."""
+    def begin(self, last: int, single: Solution, first: Array | None = None) -> None:
+        """Frames 0 to ``last`` at once, from the answers of each frame alone; ``first`` as in
+        ``solve_smooth``."""
         self._arrive(last)
         now = slice(0, last + 1)
-        self.pose[now], self.bias[now] = first_poses(self._motion(now), single, None)
+        self.pose[now], self.bias[now] = first_poses(self._motion(now), single, first)
         for _ in self.settings.smooth_gates_m:
             self.round()
 
