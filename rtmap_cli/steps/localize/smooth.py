@@ -28,6 +28,9 @@ _START_SHARE = 0.1
 _FIELD_DOUBT = 0.25
 # Frames in which one error of an element or of the map is seen, at most.
 _MOST_REPEATS = 100.0
+# Errors that persist fade on the way; what of the repeats the stated covariance counts (with all
+# of them regions that should hold 90 % hold 98 %).
+_FADING = 0.5
 
 
 def solve_smooth(
@@ -75,7 +78,7 @@ def solve_smooth(
         shift[asked] = 0.0
     if field is None:
         raise ValueError("smooth_gates_m is empty")
-    noise = noise_of(lines, seen, linear, model, shares.stated, map_repeats)
+    noise = noise_of(lines, seen, linear, model, shares.stated, shares.stated_map_repeats)
     weight = judgement.weight(noise)
     system, information, chi2 = _system(field, weight, noise, motion, pose, bias)
     used = seen.sum_by_frame(((weight > 0) & judgement.fits[:, None]).sum(-1))
@@ -87,25 +90,30 @@ def solve_smooth(
 @dataclass(frozen=True)
 class Shares:
     """Shares (E,) of the stated variance that the offset of an element has: where it is
-    ``judged``, ``solved`` for and in the ``stated`` covariance; ``map_repeats`` (E,): frames that
-    see one error of the map."""
+    ``judged``, ``solved`` for and in the ``stated`` covariance; ``map_repeats``,
+    ``stated_map_repeats`` (E,): frames that see one error of the map."""
 
     judged: float
     solved: Array
     stated: Array
     map_repeats: Array
+    stated_map_repeats: Array
 
 
 def shares_of(seen: Detections, spacing: Array, model: ErrorModel) -> Shares:
     """How often errors are counted; ``spacing`` (T,) metres between frames."""
     between = spacing[seen.frame]
+    asked = seen.chain >= 0
     repeats = np.clip(model.element_length_m / between, 1.0, _MOST_REPEATS)
-    asked = np.where(seen.chain >= 0, np.minimum(2.0 * repeats, _MOST_REPEATS), 1.0)
+    of_asked = np.minimum(2.0 * repeats, _MOST_REPEATS)
+    of_map = np.clip(model.map_persist_m / between, 1.0, _MOST_REPEATS)
+    fading = np.where(asked, 1.0, _FADING)
     return Shares(
         judged=model.element_share + _FIELD_DOUBT * model.place_share,
-        solved=model.element_share * asked,
-        stated=model.element_share * np.maximum(repeats, asked),
-        map_repeats=np.clip(model.map_persist_m / between, 1.0, _MOST_REPEATS),
+        solved=model.element_share * np.where(asked, of_asked, 1.0),
+        stated=model.element_share * np.where(asked, of_asked, np.maximum(_FADING * repeats, 1.0)),
+        map_repeats=of_map,
+        stated_map_repeats=np.maximum(fading * of_map, 1.0),
     )
 
 
