@@ -17,13 +17,18 @@ pytest.importorskip("onnxscript", reason="onnxscript is not installed (extra: tr
 import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
 from rtmap_models.architecture import build_network  # noqa: E402
-from rtmap_models.bev import BLOCK  # noqa: E402
+from rtmap_models.bev import BLOCK, BevWarp  # noqa: E402
 from rtmap_models.config import load_config  # noqa: E402
 from rtmap_models.export import onnx_file  # noqa: E402
 from rtmap_models.export.borders import pad_with_zeros  # noqa: E402
 from rtmap_models.export.example import example_inputs  # noqa: E402
 from rtmap_models.export.lean import lean  # noqa: E402
-from rtmap_models.export.onnx_file import read_configuration, read_weights  # noqa: E402
+from rtmap_models.export.lean_warp import AT_ONCE  # noqa: E402
+from rtmap_models.export.onnx_file import (  # noqa: E402
+    read_configuration,
+    read_weights,
+    short_indices,
+)
 from rtmap_models.training.checkpoint import load_network, save_checkpoint  # noqa: E402
 from training_frames import tiny_config  # noqa: E402
 
@@ -184,15 +189,55 @@ def test_places_stay_single_precision(weights: Path, exported: dict[str, Any]) -
 
 
 def test_every_map_is_sampled_with_zero_padding(exported: dict[str, Any]) -> None:
-    """Once the layers of the decoder and the picture have read theirs."""
+    """In every layer of the decoder four times; the picture is gathered from the bytes."""
     model = onnx.load(exported["path"])
     samplings = [n for n in model.graph.node if n.op_type == "GridSample"]
     padding = [a.s for n in samplings for a in n.attribute if a.name == "padding_mode"]
     assert padding == [b"zeros"] * len(samplings)
     settings = read_configuration(exported["path"])
-    warped = BLOCK**2 * settings["supersample"] ** 2  # one call per point of a block
-    assert len(samplings) == warped + 3 * settings["layers"]
+    assert len(samplings) == 4 * settings["layers"]
     assert pad_with_zeros(model) == 0
+
+
+def test_bytes_are_gathered_by_short_indices(exported: dict[str, Any]) -> None:
+    """Four neighbours of every point; images are never made floats."""
+    model = onnx.load(exported["path"])
+    inferred = onnx.shape_inference.infer_shapes(model).graph
+    kinds = {v.name: v.type.tensor_type.elem_type for v in [*inferred.value_info, *inferred.input]}
+    byte, short = onnx.TensorProto.UINT8, onnx.TensorProto.INT32
+    gathers = [n for n in model.graph.node if n.op_type == "GatherElements"]
+    of_bytes = [n for n in gathers if kinds[n.input[0]] == byte]
+    points = BLOCK**2 * read_configuration(exported["path"])["supersample"] ** 2
+    assert len(of_bytes) == 4 * points // AT_ONCE
+    assert {kinds[n.input[1]] for n in of_bytes} == {short}
+    assert all(n.op_type in ("Reshape", "GatherElements") for n in _readers(model, "images"))
+    assert short_indices(model) == 0
+
+
+def _readers(model: onnx.ModelProto, name: str) -> list[onnx.NodeProto]:
+    """Nodes that read a value or another shape of it, but not those that ask for its shape."""
+    found: list[onnx.NodeProto] = []
+    for node in model.graph.node:
+        if name in node.input and node.op_type != "Shape":
+            found += [node, *(_readers(model, node.output[0]) if node.op_type == "Reshape" else [])]
+    return found
+
+
+@pytest.mark.parametrize("size", [(1, 7), (3, 2)])
+def test_the_warp_that_is_traced_reads_the_same_pixels(size: tuple[int, int]) -> None:
+    """Noise in every pixel, points outside all cameras, on the rims, and an absent camera."""
+    warp = BevWarp(36.0, 18.0, 31, 61, 2)  # blocks reach beyond the picture
+    config = load_config("rtmap-tiny")
+    _, ego_to_image, *_ = example_inputs(config, *size, 1)
+    ego_to_image[-1, -1] = 0.0
+    height, width = config.image_size
+    images = torch.randint(0, 256, (*size, height, width, 3), dtype=torch.uint8)
+    want = warp(images, ego_to_image)
+    with lean(warp):
+        got = warp(images, ego_to_image)
+    assert ((want[:, 3] == 0) == (got[:, 3] == 0)).all() and (want[:, 3] > 0).float().mean() > 0.2
+    torch.testing.assert_close(got, want, atol=0.1, rtol=0.0)
+    assert (got - want).abs().mean() < 1e-3
 
 
 @pytest.mark.parametrize("channels", [3, 20])

@@ -3,7 +3,7 @@
 The same sums as `RefineLayer.forward`, with coordinates and channels in front and vertices last
 (B, C, Q, V): then x and y are whole planes, all places where a map is read stand in one list, the
 samples come as the products with weights want them, and the convolution along the vertices is an
-ordinary one. Maps that are read at the same places are read at once.
+ordinary one.
 """
 
 from __future__ import annotations
@@ -32,13 +32,15 @@ WIDE = tuple(o for d in WIDE_OFFSETS_M for o in (d, -d))
 
 
 class _Read(NamedTuple):
-    """What is the same for all layers: ``fine`` (B, F + 3 C, H/2, W/2) with the field behind it,
-    ``coarse`` and ``side`` as in `Maps`; ``own`` (B, C, 1, 1, Q, V), 1 for the query's class."""
+    """What is the same for all layers: the maps as in `Maps`; ``own`` (B, C, 1, 1, Q, V), 1 for
+    the query's class; ``vertex`` (V, Q V), 1 for the vertex."""
 
     fine: Tensor
     coarse: Tensor
     side: Tensor
+    field: Tensor
     own: Tensor
+    vertex: Tensor
 
 
 def decode(
@@ -48,7 +50,8 @@ def decode(
     classes, vertices = self.layers[0].classes, queries.points.shape[2]
     own = F.one_hot(queries.class_id, classes).float().transpose(1, 2)[:, :, None, None, :, None]
     own = own.expand(-1, -1, -1, -1, -1, vertices)
-    maps = _Read(torch.cat([fine, field], dim=1), coarse, self.side(coarse), own)
+    vertex = torch.eye(vertices).repeat(1, queries.points.shape[1])
+    maps = _Read(fine, coarse, self.side(coarse), field, own, vertex)
     q, points = queries.features, queries.points.permute(0, 3, 1, 2)
     for layer in self.layers:
         q, points, log_scale, logits = _refine(layer, q, points, maps, bias)
@@ -65,26 +68,37 @@ def _refine(
     tangent = tangents(points)
     local = ((points - points.mean(dim=3, keepdim=True)) / 10.0).flatten(2)
     normal = torch.cat([-tangent[:, 1:], tangent[:, :1]], dim=1)
-    near, far, wide, pull = _look(flat, tangent, normal, maps, layer.half_range)
+    near, far, wide, offset, pull = _look(flat, tangent, normal, maps, layer.half_range)
     angle = (scaled[:, :, None] * layer.frequencies[:, None]).flatten(1, 2)
-    geometry = torch.cat([tangent, local, angle.sin(), angle.cos()], dim=1)
-    e = layer.read.weight @ torch.cat([near, far], dim=1)
-    e = e + layer.wide.weight @ wide + layer.place.weight @ geometry
+    vertex = maps.vertex[None].expand(batch, -1, -1)
+    rest = torch.cat([offset, tangent, local, angle.sin(), angle.cos(), vertex], dim=1)
+    beside, straight, aside, other = _weights(layer, far.shape[1])
+    e = beside @ near + straight @ far + aside @ wide + other @ rest
     asked = layer.ask(q) + (layer.read.bias + layer.place.bias)
-    e = e.unflatten(2, (count, vertices)) + asked.transpose(1, 2)[..., None]
-    e = F.relu(e + layer.vertex.t()[:, None])
+    e = F.relu(e.unflatten(2, (count, vertices)) + asked.transpose(1, 2)[..., None])
     along = F.conv2d(e, layer.along.weight[:, :, None], layer.along.bias, padding=(0, 2))
     e = layer.point_norm((e + F.relu(along)).permute(0, 2, 3, 1))  # (B, Q, V, point_width)
     q = layer.norms[0](q + layer.gather(e.flatten(2)))
     place = scaled.reshape(batch, 2, count, vertices).permute(0, 2, 3, 1).flatten(2)
     q = layer.norms[1](q + layer._attend(q, layer.position(place), bias))
     q = layer.norms[2](q + layer.feed(q))
-    h = F.relu(layer.from_point(e) + (layer.from_query(q)[:, :, None] + layer.head_vertex))
+    query = layer.from_query(q)[:, :, None] + (layer.head_vertex + layer.from_point.bias)
+    h = F.relu(e @ layer.from_point.weight.t() + query)
     step = layer.move(h)
     drawn = layer.gate(h)[..., 0].sigmoid()[:, None] * pull.unflatten(2, (count, vertices))
     shift = layer.whole(q).unflatten(2, (vertices, 2)) * 8.0
     moved = points + drawn + (step[..., :2] * 2.0 + shift).permute(0, 3, 1, 2)
     return q, moved, step[..., 2:].clamp(-4, 4), layer.classify(q)
+
+
+def _weights(layer: RefineLayer, coarse: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of what is read beside the line, on it, metres to its sides (each (point_width, channels of
+    the map · places), as samples come), and of the rest."""
+    field = 3 * len(BESIDE)
+    beside = layer.read.weight[:, :-coarse].unflatten(1, (len(BESIDE), -1)).transpose(1, 2)
+    aside = layer.wide.weight[:, :-field].unflatten(1, (len(WIDE), -1)).transpose(1, 2)
+    other = torch.cat([layer.wide.weight[:, -field:], layer.place.weight, layer.vertex.t()], dim=1)
+    return beside.flatten(1), layer.read.weight[:, -coarse:], aside.flatten(1), other
 
 
 def tangents(points: Tensor) -> Tensor:
@@ -102,23 +116,23 @@ def tangents(points: Tensor) -> Tensor:
 
 def _look(
     points: Tensor, tangent: Tensor, normal: Tensor, maps: _Read, half_range: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Planes (B, 2, K) → what `read` takes near and far, what `wide` takes, and the pull."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Planes (B, 2, K) → samples (B, channels · places, K) beside the line, on it and metres to
+    its sides, what `wide` takes of the field, and the pull."""
     offsets = torch.tensor([*BESIDE, *WIDE])[:, None]
     at = (points[:, :, None] + normal[:, :, None] * offsets) / half_range[:, None, None]
-    read = _sample(maps.fine, at[:, :, :3])  # (B, F + 3 C, 3, K)
+    near = _sample(maps.fine, at[:, :, :3]).flatten(1, 2)
     far = _sample(maps.coarse, at[:, :, :1])[:, :, 0]
-    wide = _sample(maps.side, at[:, :, 3:]).transpose(1, 2).flatten(1, 2)
+    wide = _sample(maps.side, at[:, :, 3:]).flatten(1, 2)
+    field = _sample(maps.field, at[:, :, :3])  # (B, 3 C, 3 places, K)
     classes, (count, vertices) = maps.own.shape[1], maps.own.shape[4:]
-    split = read.shape[1] - 3 * classes
-    near = read[:, :split].transpose(1, 2).flatten(1, 2)
-    field = read[:, split:].unflatten(3, (count, vertices)).unflatten(1, (classes, 3))
+    field = field.unflatten(3, (count, vertices)).unflatten(1, (classes, 3))
     own = (field * maps.own).sum(dim=1).flatten(3)  # (B, 3 values, 3 places, K)
     offset = own[:, 1:] / FIELD_SCALE_M
     across = (offset * normal[:, :, None]).sum(1)
     pull = offset[:, :, 0]
     along = (pull * tangent).sum(1, keepdim=True)
-    return near, far, torch.cat([wide, own[:, 0], across, along, pull], dim=1), own[:, 1:, 0]
+    return near, far, wide, torch.cat([own[:, 0], across, along, pull], dim=1), own[:, 1:, 0]
 
 
 def _sample(features: Tensor, at: Tensor) -> Tensor:

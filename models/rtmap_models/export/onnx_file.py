@@ -74,6 +74,7 @@ def export_onnx(
     network = network.eval()
     model = _trace(network)
     _clean(model)
+    short_indices(model)
     pad_with_zeros(model)
     if half:
         to_half(model)
@@ -145,6 +146,30 @@ def _fold(model: Any) -> onnx.ModelProto:
     ):
         step(model)
     return onnx_ir.to_proto(model)
+
+
+def short_indices(model: onnx.ModelProto) -> int:
+    """Let ``GatherElements`` take int32 indices that were made long for it; returns how many.
+
+    torch gathers by int64 only, ONNX by both; the short ones are read and made faster.
+    """
+    graph = onnx.shape_inference.infer_shapes(model).graph
+    kinds = {v.name: v.type.tensor_type.elem_type for v in graph.value_info}
+    longer = {
+        n.output[0]: n.input[0]
+        for n in model.graph.node
+        if n.op_type == "Cast" and kinds.get(n.input[0]) == TensorProto.INT32
+    }
+    count = 0
+    for node in model.graph.node:
+        if node.op_type == "GatherElements" and node.input[1] in longer:
+            node.input[1] = longer[node.input[1]]
+            count += 1
+    used = {name for node in model.graph.node for name in node.input}
+    idle = [n for n in model.graph.node if n.output[0] in longer and n.output[0] not in used]
+    for node in idle:
+        model.graph.node.remove(node)
+    return count
 
 
 def _clean(model: onnx.ModelProto) -> None:
