@@ -39,13 +39,18 @@ class GridField:
         self.width = length_m / np.sqrt(2.0)
         self.spacing = 1.25 * self.width
 
+    def axes(self, points: Array) -> tuple[Index, Array]:
+        """First cells (n, 2) that (n, 2) map points see per axis, and values (n, SIDE, 2) of the
+        `SIDE` from there: a bump's value is the product of both axes'."""
+        first = np.floor(points / self.spacing).astype(np.int64) - self.SIDE // 2 + 1
+        away = points[:, None] - (first[:, None] + np.arange(self.SIDE)[:, None]) * self.spacing
+        value = np.exp(-0.5 * (away / self.width) ** 2)
+        return first, value / np.sqrt((value * value).sum(1, keepdims=True))
+
     def basis(self, points: Array) -> tuple[Index, Array]:
         """Cells (n, 16, 2) of the bumps that (n, 2) map points see and their values (n, 16)."""
-        base = np.floor(points / self.spacing).astype(np.int64)
-        offset = np.arange(self.SIDE) - self.SIDE // 2 + 1
-        cells = base[:, :, None] + offset
-        value = np.exp(-0.5 * ((points[:, :, None] - cells * self.spacing) / self.width) ** 2)
-        value /= np.sqrt((value * value).sum(-1, keepdims=True))
-        grid = np.stack(np.broadcast_arrays(cells[:, 0, :, None], cells[:, 1, None, :]), -1)
-        both = value[:, 0, :, None] * value[:, 1, None, :]
-        return grid.reshape(len(points), -1, 2), both.reshape(len(points), -1)
+        first, value = self.axes(points)
+        offset = np.arange(self.SIDE)
+        grid = np.stack(np.meshgrid(offset, offset, indexing="ij"), -1).reshape(-1, 2)
+        both = value[:, :, None, 0] * value[:, None, :, 1]
+        return first[:, None] + grid, both.reshape(len(points), -1)

@@ -83,33 +83,36 @@ class PlaceField:
         rows = np.flatnonzero(self.linear.found)
         if not len(rows):
             return [], np.empty(0, np.int64), np.empty(0, np.int64)
-        cells, values = field.basis(lines.xy[self.linear.sample.ravel()[rows]])
+        cell, value = field.axes(lines.xy[self.linear.sample.ravel()[rows]])
         group_of = group[rows]
         low, high = np.zeros((len(groups), 2), np.int64), np.full((len(groups), 2), -1)
         first = np.flatnonzero(np.diff(group_of, prepend=-1))
-        low[group_of[first]] = np.minimum.reduceat(cells[:, 0], first)
-        high[group_of[first]] = np.maximum.reduceat(cells[:, -1], first)
+        low[group_of[first]] = np.minimum.reduceat(cell, first)
+        high[group_of[first]] = np.maximum.reduceat(cell, first) + field.SIDE - 1
         box = high - low + 1
         area = box.prod(1)
-        start = np.cumsum(area) - area
-        local = cells - low[group_of, None]
-        slot = start[group_of, None] + local[..., 0] * box[group_of, None, 1] + local[..., 1]
+        start, across = np.cumsum(area) - area, box[:, 1]
+        x, y = (cell - low[group_of]).T
+        corner = start[group_of] + x * across[group_of] + y
+        side = np.arange(field.SIDE)
+        slot = (side * across[group_of, None])[..., None] + side + corner[:, None, None]
         used = np.zeros(int(area.sum()), bool)
         used[slot] = True
-        name = np.empty(len(used), np.int64)
-        code = self.seen.code[rows // per, None]
-        name[slot] = (code * 2 * _HALF + cells[..., 0] + _HALF) * 2 * _HALF + cells[..., 1] + _HALF
-        owner = np.repeat(np.arange(len(groups)), area)[used]
-        bump, names, born = _births(name[used], chunk[frame[owner]])
+        slots = np.flatnonzero(used)
+        owner = np.repeat(np.arange(len(groups)), area)[slots]
+        x, y = np.array(np.divmod(slots - start[owner], across[owner])) + low[owner].T + _HALF
+        code = np.array([c for _, c, _ in groups], np.int64)[owner]
+        bump, names, born = _births((code * 2 * _HALF + x) * 2 * _HALF + y, chunk[frame[owner]])
         order = np.lexsort((bump, owner))
         many = np.bincount(owner, minlength=len(groups))
         ends = np.cumsum(many)
         column = np.empty(len(used), np.int64)
-        column[np.flatnonzero(used)[order]] = _number(owner, many)
+        column[slots[order]] = _number(owner, many)
         place = np.cumsum(sizes * per * many) - sizes * per * many
         basis = np.zeros(int((sizes * per * many).sum()))
         row = rows - ((np.cumsum(sizes) - sizes) * per)[group_of]
-        basis[(place[group_of] + row * many[group_of])[:, None] + column[slot]] = values
+        slot = column[slot] + (place[group_of] + row * many[group_of])[:, None, None]
+        basis[slot] = value[:, :, None, 0] * value[:, None, :, 1]
         bump = bump[order]
         out = []
         for k in np.flatnonzero(many):
