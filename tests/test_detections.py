@@ -118,6 +118,20 @@ def _broken(change: Any) -> dict[str, Any]:
         (lambda d: d["results"][1].update(timestamp_ns=5), "earlier"),
         (lambda d: d["results"][1].pop("initial_pose"), "frame 4, initial_pose"),
         (lambda d: d["results"][0]["initial_sigma"].update(yaw_rad=0), "above zero"),
+        (lambda d: d["results"][0]["initial_sigma"].update(easting=-1.0), "above zero"),
+        (lambda d: d["results"][0]["initial_sigma"].update(northing=float("nan")), "not finite"),
+        (
+            lambda d: d["results"][1].update(odometry_sigma={"dx": 0.1, "dy": 0, "dyaw": 0.1}),
+            "frame 4: odometry_sigma must be above zero",
+        ),
+        (
+            lambda d: d["results"][0]["vectors"][0]["sigma"].__setitem__(2, [0.1, -0.1]),
+            "above zero",
+        ),
+        (
+            lambda d: d["results"][0]["vectors"][0]["sigma"].__setitem__(2, [float("nan"), 0.1]),
+            "not finite",
+        ),
         (lambda d: d["results"][0]["vectors"][1].pop("cls_name"), "frame 0, vector 1: cls_name"),
         (lambda d: d["results"][0]["vectors"][1].update(cls_name="tree"), "tree"),
         (lambda d: d["results"][0]["vectors"][1].update(confidence_level=1.5), "outside"),

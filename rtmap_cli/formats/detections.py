@@ -194,6 +194,8 @@ def _frames(path: Path, results: list[dict[str, Any]]) -> RunFrames:
                 if given is None
                 else _numbers(path, f"{where}, odometry_sigma", given, keys)
             )
+            if (odometry_sigma[i] <= 0).any():
+                raise BadInput(path, f"{where}: odometry_sigma must be above zero")
     return RunFrames(
         frame=frame,
         timestamp_ns=times,

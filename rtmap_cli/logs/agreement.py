@@ -35,12 +35,14 @@ class Agreement:
     detections: int
     found: int
 
-    @property
-    def doubt(self) -> str:
-        """What speaks against run and map being of one place, in words; empty where nothing."""
+    def doubt(self, enough: float = ENOUGH_DETECTIONS) -> str:
+        """What speaks against run and map being of one place, in words; empty where nothing.
+
+        ``enough``: share of the detections that must lie on the map.
+        """
         if self.in_range < ENOUGH_FRAMES * self.frames:
             return f"{self.frames - self.in_range} of {self.frames} frames have no element in range"
-        if self.found < ENOUGH_DETECTIONS * self.detections:
+        if self.found < enough * self.detections:
             found = f"only {self.found} of {self.detections} detections"
             return f"{found} lie within {NEAR_M} m of an element of their class"
         return ""
@@ -79,15 +81,18 @@ def _views(traversal: Traversal) -> NDArray[Any]:
 
 
 def warning(
-    traversals: Sequence[Traversal], vector_map: VectorMap, where: str | Path
+    traversals: Sequence[Traversal],
+    vector_map: VectorMap,
+    where: str | Path,
+    enough: float = ENOUGH_DETECTIONS,
 ) -> str | None:
     """One line for people when runs and a map do not seem to be of the same place, else None.
 
-    An empty map agrees with everything: it is a beginning.
+    An empty map agrees with everything: it is a beginning. ``enough`` as in ``Agreement.doubt``.
     """
     if not len(vector_map):
         return None
-    doubts = [(t.run_id, agreement(t, vector_map).doubt) for t in traversals]
+    doubts = [(t.run_id, agreement(t, vector_map).doubt(enough)) for t in traversals]
     doubts = [(name, doubt) for name, doubt in doubts if doubt]
     if not doubts:
         return None

@@ -137,6 +137,12 @@ def _check_frames(run: Run) -> None:
     if bad.any():
         frame = int(run.frames.frame[bad][0])
         raise BadInput(where, f"frame {frame}: the sigma of the initial pose is not above zero")
+    # An unknown sigma of odometry (NaN) is assumed, a senseless one is not.
+    moved = np.isfinite(run.frames.odometry).all(axis=1)
+    bad = moved & (run.frames.odometry_sigma <= 0).any(axis=1)
+    if bad.any():
+        frame = int(run.frames.frame[bad][0])
+        raise BadInput(where, f"frame {frame}: the sigma of its odometry is not above zero")
 
 
 def _lines(
