@@ -42,15 +42,32 @@ def solve_held(
     from_prior[2] = wrap_angle(from_prior[2])
     # GNSS is where the search begins.
     x = -from_prior
+    # Cholesky factors of what x and y know of each other, which is the same at all turns.
+    xx, xy, yy = q[1, 1] + prior[0], q[1, 2], q[2, 2] + prior[1]
+    a = np.sqrt(xx)
+    d = xy / a
+    e = np.sqrt(yy - d * d)
+    z = np.ones((5, len(at)))
     for _ in range(_ROUNDS):
-        h, gradient = _normal(q, x)
-        h[[0, 1, 2], [0, 1, 2]] += prior
-        gradient += prior * (x + from_prior)
-        step = _solve3(h, gradient)
+        c, s = np.cos(x[2]), np.sin(x[2])
+        z[0], z[1:3], z[3] = c - 1.0, x[:2], s
+        v = (q[:4] * z).sum(1)
+        pull = prior * (x + from_prior)
+        xt, yt = c * q[1:3, 3] - s * q[1:3, 0]
+        tt = c * c * q[3, 3] - 2.0 * s * c * q[0, 3] + s * s * q[0, 0] + prior[2]
+        g = xt / a
+        k = (yt - d * g) / e
+        first = (v[1] + pull[0]) / a
+        second = (v[2] + pull[1] - d * first) / e
+        turn = c * v[3] - s * v[0] + pull[2] - g * first - k * second
+        turn /= tt - g * g - k * k
+        second = (second - k * turn) / e
+        step = np.stack([(first - d * second - g * turn) / a, second, turn])
         x = x - step
         if np.abs(step).max(initial=0.0) <= done:
             break
-    return at + x.T, np.moveaxis(h, -1, 0)
+    information = np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+    return at + x.T, np.moveaxis(information, -1, 0)
 
 
 def _grams(seen: Detections, linear: Linear, noise: Noise) -> Array:
@@ -76,30 +93,3 @@ def _grams(seen: Detections, linear: Linear, noise: Noise) -> Array:
             v, o = slice(low * count, high * count), b[2 * low : 2 * high]
             out[t] = vertices[:, v] @ weighted[:, v].T - o.T @ o
     return out
-
-
-def _normal(q: Array, x: Array) -> tuple[Array, Array]:
-    """Normal equations (3, 3, T) and gradient (3, T) of Grams (5, 5, T) at (3, T)."""
-    c, s = np.cos(x[2]), np.sin(x[2])
-    z = np.stack([c - 1.0, x[0], x[1], s, np.ones_like(c)])
-    v = (q[:4] * z).sum(1)
-    gradient = np.stack([v[1], v[2], c * v[3] - s * v[0]])
-    h = np.empty((3, 3, len(c)))
-    h[:2, :2] = q[1:3, 1:3]
-    h[:2, 2] = h[2, :2] = c * q[1:3, 3] - s * q[1:3, 0]
-    h[2, 2] = c * c * q[3, 3] - 2.0 * s * c * q[0, 3] + s * s * q[0, 0]
-    return h, gradient
-
-
-def _solve3(h: Array, b: Array) -> Array:
-    """Solve (3, 3, T) symmetric systems for (3, T) by Cholesky, all at once."""
-    a = np.sqrt(h[0, 0])
-    d, g = h[0, 1] / a, h[0, 2] / a
-    e = np.sqrt(h[1, 1] - d * d)
-    k = (h[1, 2] - d * g) / e
-    m = np.sqrt(h[2, 2] - g * g - k * k)
-    u = b[0] / a
-    v = (b[1] - d * u) / e
-    w = (b[2] - g * u - k * v) / m / m
-    v = (v - k * w) / e
-    return np.stack([(u - d * v - g * w) / a, v, w])
