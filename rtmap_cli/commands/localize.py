@@ -117,8 +117,7 @@ def command(
     check_same_crs(map_crs(map_path), str(read_run_info(run)["crs"]), map_path)
     loaded = read_run(run)
     reach = _reach(loaded, search, method)
-    if lag is not None:
-        _check_lag(smooth, method, reach, search is not None)
+    _check(smooth, lag, method, (prior, start), reach, search is not None)
     box = bounds(loaded, reach) if len(loaded.frames) else None
     vector_map = read_map(map_path, map_version, box)
     if residuals and method == "end-to-end":
@@ -182,7 +181,21 @@ def _reach(run: Run, search: tuple[float, float] | None, method: str) -> Reach |
     return reach_of(run.frames.sigma)
 
 
-def _check_lag(smooth: bool, method: str, reach: Reach | None, asked: bool) -> None:
+def _check(
+    smooth: bool,
+    lag: float | None,
+    method: str,
+    leans: tuple[str, str],
+    reach: Reach | None,
+    asked: bool,
+) -> None:
+    """UsageError for options that exclude each other; ``asked`` for the search, or implied."""
+    if leans != ("initial", "initial") and (method == "end-to-end" or reach is not None):
+        raise UsageError(
+            "--prior and --start have no use for --method end-to-end, nor for a search"
+        )
+    if lag is None:
+        return
     if not smooth or method == "end-to-end":
         raise UsageError("--lag needs --smooth, and detections to smooth")
     if reach is not None:

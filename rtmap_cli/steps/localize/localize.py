@@ -18,7 +18,7 @@ from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.localize.answer import poses_of
 from rtmap_cli.steps.localize.begin import single_frames
 from rtmap_cli.steps.localize.explain import residuals_at
-from rtmap_cli.steps.localize.frames import has_matches, read_detections
+from rtmap_cli.steps.localize.frames import Detections, has_matches, read_detections
 from rtmap_cli.steps.localize.given import Rest, known_end_to_end, start_of, with_prior
 from rtmap_cli.steps.localize.heights import with_heights
 from rtmap_cli.steps.localize.lines import MapLines
@@ -81,13 +81,10 @@ def localize(
     seen = read_detections(run, lines, settings, matched)
     if not len(seen.frame):
         raise NoAnswer(f"{run.log_id}: no detection can be compared with the map")
-    place: Found | None = None
-    gnss = seen.pose
+    gnss, place, around = seen.pose, None, None
     if search is not None:
-        motion = motion_of(run.frames, seen.pose, model or ErrorModel(), settings)
-        place = relocate(lines, seen, motion, search)
-        gnss, seen = seen.pose, moved(seen, place)
-    around = None if place is None else place.pose
+        place = _searched(run, lines, seen, search, model or ErrorModel(), settings)
+        around, seen = place.pose, moved(seen, place)
     if begin == "end-to-end":
         around = start_of(run, origin)
     name = "matches" if matched else "geometry"
@@ -114,6 +111,17 @@ def localize(
     if explain is not None:
         explain(residuals_at(run, lines, seen, start.pose, model, settings))
     return poses
+
+
+def _searched(
+    run: Run,
+    lines: MapLines,
+    seen: Detections,
+    reach: Reach,
+    model: ErrorModel,
+    settings: Settings,
+) -> Found:
+    return relocate(lines, seen, motion_of(run.frames, seen.pose, model, settings), reach)
 
 
 def bounds(run: Run, search: Reach | None = None) -> tuple[float, float, float, float]:
