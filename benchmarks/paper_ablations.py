@@ -41,6 +41,8 @@ from rtmap_models.training.checkpoint import load_network, load_resumable
 from rtmap_models.training.recipe import load_recipe
 from rtmap_models.training.train import TrainOptions, train
 
+from rtmap_cli.tables import whole_file
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -115,16 +117,30 @@ def trained(name: str, base: PaperConfig, start: str | None, options: argparse.N
     return path
 
 
-def row_of(readings: measured.Readings, found: measured.Figures) -> dict[str, Any]:
-    """The figures of one variant as JSON has them."""
-    names = (*measured.MAP_FIGURES, measured.EXISTENCE)
-    return {
-        "figures": {name: float(found[name][0]) for name in names},
+def read(weights: Path, test: Frames, drawn: Any) -> tuple[dict[str, Any], measured.Figures]:
+    """The figures of a variant as JSON has them, and with the test towns drawn anew.
+
+    They are kept beside the weights and read again when weights or test frames are others.
+    """
+    path = weights.with_suffix(".figures.json")
+    if path.exists() and path.stat().st_mtime_ns >= weights.stat().st_mtime_ns:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        if kept["frames"] == len(test) and kept["rows"] == len(drawn):
+            return kept["row"], {name: np.array(v) for name, v in kept["drawn"].items()}
+    readings = measured.read(load_network(weights)[0], test)
+    found = measured.figures(readings, drawn)
+    row = {
+        "figures": {n: float(found[n][0]) for n in (*measured.MAP_FIGURES, measured.EXISTENCE)},
         "poses": {
             way: [error.mean(axis=0).tolist(), np.quantile(error, 0.9, axis=0).tolist()]
             for way, error in readings.poses.items()
         },
     }
+    content = {"frames": len(test), "rows": len(drawn), "row": row}
+    content["drawn"] = {name: values.tolist() for name, values in found.items()}
+    with whole_file(path) as part:
+        part.write_text(json.dumps(content), encoding="utf-8")
+    return row, found
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -161,10 +177,9 @@ def main(arguments: list[str] | None = None) -> None:
     full: measured.Figures | None = None
     for name in options.only:
         weights = trained(name, base, start, options)
-        readings = measured.read(load_network(weights)[0], test)
-        found = measured.figures(readings, drawn)
+        row, found = read(weights, test, drawn)
         full = found if name == FULL else full
-        rows[name] = row_of(readings, found) | {"cpu_minutes": round(minutes_of(weights), 1)}
+        rows[name] = row | {"cpu_minutes": round(minutes_of(weights), 1)}
         if full is not None and name != FULL:
             rows[name]["against full"] = measured.differences(found, full)
         print(f"{name}: {rows[name]['figures']}", flush=True)
