@@ -70,6 +70,7 @@ def _run() -> Node:
         "ego_frame": _text("x forward, y left, z up, metres"),
     }
     needed = list(properties)
+    properties["ground_z"] = _number("height of the road in the ego frame, m, where it is known")
     properties["model_footprint"] = _footprint()
     description = "How a run was made; further members say by what (model, options, map_version …)."
     return _document(RUN_SCHEMA, "RUN/run.json", _object(properties, needed, description))

@@ -134,6 +134,14 @@ def test_poses_that_are_no_numbers(rtmap, tmp_path: Path) -> None:
     _one_line(rtmap, paths, 3, "the pose of frame 1 is not finite")
 
 
+@pytest.mark.parametrize("value", ["low", True, float("inf")])
+def test_a_ground_that_is_no_height(rtmap, tmp_path: Path, value) -> None:
+    truth = drive(3)
+    run = run_of(truth, observed(town(), truth))
+    run = replace(run, info=run.info | {"ground_z": value})
+    _one_line(rtmap, _files(tmp_path / "a", run, town()), 3, "ground_z is not a number")
+
+
 @pytest.mark.parametrize("options", MODES[1:])
 def test_a_gap_in_the_odometry(rtmap, tmp_path: Path, options) -> None:
     """GNSS bridges a step that is not known, and frames behind it do not inherit a jump."""

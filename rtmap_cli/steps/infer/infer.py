@@ -147,6 +147,7 @@ def infer_log(
         {"x": [model.info.range_m[0], model.info.range_m[2]],
          "y": [model.info.range_m[1], model.info.range_m[3]]},
         source="infer",
+        ground_z=log.ground_z,
         model=model.info.name,
         model_sha256=model.info.sha256,
         model_footprint=model.info.footprint.as_json(),

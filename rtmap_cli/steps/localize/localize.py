@@ -67,6 +67,7 @@ def localize(
     settings = settings or Settings()
     check_same_crs(vector_map.crs, run.crs, where)
     _check_frames(run)
+    ground = _ground_z(run) if ground_z is None else ground_z
     lines, origin = _lines(run, vector_map, settings, where)
     if method == "end-to-end":
         return _end_to_end(run, origin, smooth, settings)
@@ -102,7 +103,6 @@ def localize(
     if place is not None:
         start = widened(start, place)
     poses = poses_of(run.frames, start, origin, name, model, settings)
-    ground = run.info.get("ground_z") if ground_z is None else ground_z
     time = run.frames.timestamp_ns
     live = lag is not None and lag * 1e9 < time[-1] - time[0]
     poses = with_heights(poses, run.frames.initial, vector_map, ground, live)
@@ -111,6 +111,17 @@ def localize(
     if explain is not None:
         explain(residuals_at(run, lines, seen, start.pose, model, settings))
     return poses
+
+
+def _ground_z(run: Run) -> float | None:
+    """Height of the road in the ego frame (m) as run.json states it, if it does."""
+    value = run.info.get("ground_z")
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        where = run.path / "run.json" if run.path else run.log_id
+        raise BadInput(where, "ground_z is not a number", "give the road's height in the ego frame")
+    return float(value)
 
 
 def _searched(
