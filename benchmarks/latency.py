@@ -3,22 +3,29 @@
     python benchmarks/latency.py                       the shipped model, a simulated log
     python benchmarks/latency.py --model m.onnx --log logs/monday --map map
 
-Needs the extras ``train`` and ``simulate``. Both sides take turns within one run, so that a busy
-machine slows both; figures are medians, the ratio is the median of the ratios of neighbours.
-Prints one JSON object; ``infer`` is a new process with everything: start, imports, reading and
-decoding the JPEGs, the network, writing the run.
+Needs the extras ``train`` and ``simulate``. All sides take turns within one run, so that a busy
+machine slows all; figures are medians, ratios are medians of the ratios of neighbours.
+
+With N threads a frame can have them all, or N frames are read side by side on one each, as
+``rtmap infer`` does it with onnxruntime. torch eager is timed both ways, side by side in processes
+of their own (its Python would hold one thread up for the other); the ratio that counts is against
+the better of the two. Prints one JSON object; ``infer`` is a new process with everything: start,
+imports, reading and decoding the JPEGs, the network, writing the run.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +44,9 @@ from rtmap_cli.steps.infer.model import find_model
 
 PRIORS = 20
 """Prior slots in use: about what a 72 × 36 m crop of a real map holds."""
+
+FRAMES_A_TURN = 4
+"""Frames of each of those side by side in one turn: starting and waiting then hardly count."""
 
 BARS = {"onnxruntime against torch": 1.5, "infer, frames per second": 10.0}
 
@@ -83,12 +93,85 @@ def network(path: Path, torch_side: nn.Module, cameras: int, threads: int, runs:
     }
 
 
+def side_by_side(
+    path: Path, config: str, torch_side: nn.Module, cameras: int, threads: int, runs: int
+) -> Any:
+    """Frames per second with so many threads in all: onnxruntime as ``rtmap infer`` runs it (one
+    session, a frame per thread) against torch eager with all threads on a frame, and with a frame
+    on one thread in each of so many processes."""
+    model = MapModel(str(path), 1)
+    inputs = example_inputs(torch_side.config, 1, cameras, PRIORS)
+    feed = [x.numpy() for x in inputs]
+    frames = threads * FRAMES_A_TURN
+    torch.set_num_threads(threads)
+
+    def one_after_the_other() -> None:
+        with torch.inference_mode():
+            for _ in range(frames):
+                torch_side(*inputs)
+
+    with ThreadPoolExecutor(threads) as pool, _processes(path, config, cameras, threads) as turn:
+        sides = {
+            "onnxruntime, side by side": lambda: list(
+                pool.map(lambda _: model(*feed), range(frames))
+            ),
+            "torch, all threads on a frame": one_after_the_other,
+            "torch, side by side": turn,
+        }
+        ms = take_turns(sides, runs, warm=2)
+    ours, *others = ms
+    best = np.minimum(*(ms[name] for name in others))
+    return {
+        **{f"{name}, frames/s": float(np.median(frames * 1e3 / ms[name])) for name in ms},
+        "ratio to the better of torch": float(np.median(best / ms[ours])),
+    }
+
+
+@contextmanager
+def _processes(path: Path, config: str, cameras: int, count: int) -> Iterator[Callable[[], None]]:
+    """Processes that run torch on one thread; the call lets each read `FRAMES_A_TURN` frames."""
+    context = multiprocessing.get_context("spawn")
+    pipes = [context.Pipe() for _ in range(count)]
+    call = ((path, config, cameras, theirs) for _, theirs in pipes)
+    workers = [context.Process(target=_work, args=one, daemon=True) for one in call]
+    for worker in workers:
+        worker.start()
+
+    def turn() -> None:
+        for ours, _ in pipes:
+            ours.send(FRAMES_A_TURN)
+        for ours, _ in pipes:
+            ours.recv()
+
+    try:
+        turn()  # all are ready when the first turn is over
+        yield turn
+    finally:
+        for ours, _ in pipes:
+            ours.send(0)
+        for worker in workers:
+            worker.join()
+
+
+def _work(path: Path, config: str, cameras: int, pipe: Any) -> None:
+    """One of `_processes`: reads as many frames as it is told to, until that is none."""
+    torch.set_num_threads(1)
+    network = twin(path, config)
+    inputs = example_inputs(network.config, 1, cameras, PRIORS)
+    while frames := pipe.recv():
+        with torch.inference_mode():
+            for _ in range(frames):
+                network(*inputs)
+        pipe.send(True)
+
+
 def operators(path: Path, config: Any, cameras: int, runs: int = 10, most: int = 8) -> Any:
     """Shares of onnxruntime's time by operator, from its own profiler, one thread."""
     inputs = example_inputs(config, 1, cameras, PRIORS)
     feed = dict(zip(INPUTS, [x.numpy() for x in inputs], strict=True))
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = 1, 4
+    options.enable_mem_reuse = False  # as `MapModel`
     options.enable_profiling = True
     with tempfile.TemporaryDirectory() as folder:
         options.profile_file_prefix = str(Path(folder) / "profile")
@@ -178,6 +261,12 @@ def main() -> None:
         for threads in (1, 2):
             key = f"{cameras} cameras, {threads} threads"
             report["network"][key] = network(path, side, cameras, threads, a.runs)
+    report["side by side"] = {
+        f"{cameras} cameras, 2 threads": side_by_side(
+            path, a.config, side, cameras, 2, max(2, a.runs // 3)
+        )
+        for cameras in (6, 7)
+    }
     report["operators"] = operators(path, side.config, 7)
     with tempfile.TemporaryDirectory() as folder:
         log, vector_map = (a.log, a.map) if a.log else simulate(Path(folder), a.frames)
