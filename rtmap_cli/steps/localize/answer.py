@@ -51,7 +51,7 @@ def poses_of(
         timestamp_ns=frames.timestamp_ns,
         method=method,
         pose=lift(frames.initial, solution.pose, origin),
-        covariance=_covariance(solution.covariance, model),
+        covariance=_covariance(solution, model),
         eigenvalues=values,
         weakest_direction=_signed(vectors[:, :, 0]),
         residual_count=solution.residuals.astype(np.int32),
@@ -80,12 +80,18 @@ def _information(frames: RunFrames, solution: Solution, method: str) -> Array:
     return np.linalg.inv(solution.covariance) - gnss
 
 
-def _covariance(planar: Array, model: ErrorModel) -> Array:
+def _covariance(solution: Solution, model: ErrorModel) -> Array:
     """(T, 6, 6) of x, y, z, roll, pitch, yaw; the calibration of the rig is added."""
-    out = np.zeros((len(planar), 6, 6))
+    count = len(solution.pose)
+    c, s = np.cos(solution.pose[:, 2]), np.sin(solution.pose[:, 2])
+    rig = np.zeros((count, 3, 3))
+    rig[:, :2, 0], rig[:, :2, 1] = np.stack([c, s], -1), np.stack([-s, c], -1)
+    rig[:, 2, 2] = 1.0
+    rig *= np.array([*model.rig_sigma_m, model.rig_sigma_rad])
+    out = np.zeros((count, 6, 6))
     out[:, [2, 3, 4], [2, 3, 4]] = np.square(_UNMEASURED)
-    rig = np.diag(np.square([model.rig_sigma_m, model.rig_sigma_m, model.rig_sigma_rad]))
-    out[np.ix_(range(len(planar)), (0, 1, 5), (0, 1, 5))] = planar + rig
+    planar = solution.covariance + rig @ np.swapaxes(rig, -1, -2)
+    out[np.ix_(range(count), (0, 1, 5), (0, 1, 5))] = planar
     return out
 
 

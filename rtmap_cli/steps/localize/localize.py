@@ -201,5 +201,5 @@ def _end_to_end(run: Run, origin: Array, smooth: bool, settings: Settings) -> Po
     chi2, spread = np.full(len(pose), np.nan), np.zeros_like(covariance)
     solution = Solution(pose, covariance, information, chi2, count, spread)
     # The network states its own covariance: nothing is added to it.
-    model = ErrorModel(rig_sigma_m=0.0, rig_sigma_rad=0.0)
+    model = ErrorModel(rig_sigma_m=(0.0, 0.0), rig_sigma_rad=0.0)
     return poses_of(run.frames, solution, origin, "end-to-end", model, settings)

@@ -32,9 +32,10 @@ class ErrorModel:
     # and the travel during which one error of it stays in range.
     map_sigma_m: float = 0.1
     map_length_m: float = 12.0
-    map_persist_m: float = 30.0
-    # Constant error of the rig's calibration, which no drive can show.
-    rig_sigma_m: float = 0.05
+    map_persist_m: float = 15.0
+    # Constant error of the rig's calibration along and across the vehicle (a pitch of the cameras
+    # moves what they see along it), and its turn: no drive can show them.
+    rig_sigma_m: tuple[float, float] = (0.08, 0.03)
     rig_sigma_rad: float = 0.0005
     # Offset of an element that is not what the map says it is.
     outlier_sigma_m: float = 2.0

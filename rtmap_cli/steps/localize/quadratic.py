@@ -160,11 +160,8 @@ def frame_terms(
     plain = noise_of(lines, some, linear, model, shares.judged).doubted(rule[1])
     judgement = judge(some, linear, plain, rest, model, huber)
     solved, stated = (
-        noise_of(lines, some, linear, model, share, repeats)
-        for share, repeats in (
-            (shares.solved, shares.map_repeats),
-            (shares.stated, shares.stated_map_repeats),
-        )
+        noise_of(lines, some, linear, model, share, shares.map_repeats)
+        for share in (shares.solved, shares.stated)
     )
     weights = judgement.weight(solved), judgement.weight(stated)
     used = some.sum_by_frame(((weights[1] > 0) & judgement.fits[:, None]).sum(-1))

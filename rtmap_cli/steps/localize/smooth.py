@@ -28,9 +28,9 @@ _START_SHARE = 0.1
 _FIELD_DOUBT = 0.25
 # Frames in which one error of an element or of the map is seen, at most.
 _MOST_REPEATS = 100.0
-# Errors that persist fade on the way; what of the repeats the stated covariance counts (with all
-# of them regions that should hold 90 % hold 98 %).
-_FADING = 0.5
+# An element's own offset fades on the way; what of its repeats the stated covariance counts (with
+# all of them regions that should hold 90 % hold more than 95 %).
+_FADING = 0.35
 
 
 def solve_smooth(
@@ -78,7 +78,7 @@ def solve_smooth(
         shift[asked] = 0.0
     if field is None:
         raise ValueError("smooth_gates_m is empty")
-    noise = noise_of(lines, seen, linear, model, shares.stated, shares.stated_map_repeats)
+    noise = noise_of(lines, seen, linear, model, shares.stated, map_repeats)
     weight = judgement.weight(noise)
     system, information, chi2 = _system(field, weight, noise, motion, pose, bias)
     used = seen.sum_by_frame(((weight > 0) & judgement.fits[:, None]).sum(-1))
@@ -90,14 +90,13 @@ def solve_smooth(
 @dataclass(frozen=True)
 class Shares:
     """Shares (E,) of the stated variance that the offset of an element has: where it is
-    ``judged``, ``solved`` for and in the ``stated`` covariance; ``map_repeats``,
-    ``stated_map_repeats`` (E,): frames that see one error of the map."""
+    ``judged``, ``solved`` for and in the ``stated`` covariance; ``map_repeats`` (E,): frames that
+    see one error of the map."""
 
     judged: float
     solved: Array
     stated: Array
     map_repeats: Array
-    stated_map_repeats: Array
 
 
 def shares_of(seen: Detections, spacing: Array, model: ErrorModel) -> Shares:
@@ -106,14 +105,11 @@ def shares_of(seen: Detections, spacing: Array, model: ErrorModel) -> Shares:
     asked = seen.chain >= 0
     repeats = np.clip(model.element_length_m / between, 1.0, _MOST_REPEATS)
     of_asked = np.minimum(2.0 * repeats, _MOST_REPEATS)
-    of_map = np.clip(model.map_persist_m / between, 1.0, _MOST_REPEATS)
-    fading = np.where(asked, 1.0, _FADING)
     return Shares(
         judged=model.element_share + _FIELD_DOUBT * model.place_share,
         solved=model.element_share * np.where(asked, of_asked, 1.0),
         stated=model.element_share * np.where(asked, of_asked, np.maximum(_FADING * repeats, 1.0)),
-        map_repeats=of_map,
-        stated_map_repeats=np.maximum(fading * of_map, 1.0),
+        map_repeats=np.clip(model.map_persist_m / between, 1.0, _MOST_REPEATS),
     )
 
 
