@@ -28,11 +28,11 @@ from paper_places import av2_places, town_places
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from rtmap_cli.geometry.poses import xyyaw_of
-from rtmap_cli.steps.localize.frames import Detections, read_detections
-from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.localize import localize
 from rtmap_cli.steps.localize.model import Settings
-from rtmap_cli.steps.localize.residuals import linearize
+from rtmap_cli.steps.localize.seeing.frames import Detections, read_detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import linearize
 from rtmap_cli.steps.simulate.perceiving.presets import PRESETS, Preset
 
 Array = NDArray[np.float64]

@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from paper_places import town_places
 
 from rtmap_cli.maps.element import VectorMap
-from rtmap_cli.steps.localize.frames import Detections, read_detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.drive.motion import Motion, motion_of
+from rtmap_cli.steps.localize.drive.smooth import solve_smooth
+from rtmap_cli.steps.localize.frame.single import Solution, solve_single
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import Motion, motion_of
-from rtmap_cli.steps.localize.single import Solution, solve_single
-from rtmap_cli.steps.localize.smooth import solve_smooth
+from rtmap_cli.steps.localize.seeing.frames import Detections, read_detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
 from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
 
 Array = NDArray[np.float64]

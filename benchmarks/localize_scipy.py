@@ -30,12 +30,12 @@ from paper_places import Place, town_places
 from scipy.optimize import least_squares
 
 from rtmap_cli.geometry.poses import wrap_angle
-from rtmap_cli.steps.localize.frames import Detections, read_detections
-from rtmap_cli.steps.localize.held import solve_held
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.frame.held import solve_held
+from rtmap_cli.steps.localize.frame.single import solve_single
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.residuals import Linear, Noise, judge, linearize, noise_of
-from rtmap_cli.steps.localize.single import solve_single
+from rtmap_cli.steps.localize.seeing.frames import Detections, read_detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import Linear, Noise, judge, linearize, noise_of
 from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
 
 Array = NDArray[np.float64]

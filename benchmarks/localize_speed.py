@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.poses import wrap_angle
-from rtmap_cli.steps.localize.motion import Motion, motion_terms, step_error
+from rtmap_cli.steps.localize.drive.motion import Motion, motion_terms, step_error
 
 Array = NDArray[np.float64]
 

@@ -23,17 +23,17 @@ from rtmap_cli.geometry.poses import se3_from_quaternion, xyyaw_of
 from rtmap_cli.logs.run import OUTDATED, Observations
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
 from rtmap_cli.steps.localize.answer import lift
-from rtmap_cli.steps.localize.blocks import BlockSystem
-from rtmap_cli.steps.localize.calibrate import calibrated
-from rtmap_cli.steps.localize.field import GridField, frame_basis
-from rtmap_cli.steps.localize.frames import read_detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.drive.blocks import BlockSystem
+from rtmap_cli.steps.localize.drive.motion import step_error
+from rtmap_cli.steps.localize.drive.smooth import chunks
+from rtmap_cli.steps.localize.frame.calibrate import calibrated
+from rtmap_cli.steps.localize.frame.single import solve_single
 from rtmap_cli.steps.localize.localize import localize
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import step_error
-from rtmap_cli.steps.localize.residuals import gram, gram_sum, linearize, noise_of
-from rtmap_cli.steps.localize.single import solve_single
-from rtmap_cli.steps.localize.smooth import chunks
+from rtmap_cli.steps.localize.seeing.field import GridField, frame_basis
+from rtmap_cli.steps.localize.seeing.frames import read_detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import gram, gram_sum, linearize, noise_of
 
 MODEL, SETTINGS = ErrorModel(), Settings()
 

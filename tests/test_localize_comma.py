@@ -14,9 +14,9 @@ import pytest
 
 from rtmap_cli.geometry.poses import se3_from_xyyaw, wrap_angle
 from rtmap_cli.logs.run import RunFrames
-from rtmap_cli.steps.localize.blocks import BlockSystem
+from rtmap_cli.steps.localize.drive.blocks import BlockSystem
+from rtmap_cli.steps.localize.drive.motion import STATE, Motion, motion_of, motion_terms, step_error
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import STATE, Motion, motion_of, motion_terms, step_error
 
 MODEL, SETTINGS = ErrorModel(), Settings()
 CRS = 32610

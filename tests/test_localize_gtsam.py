@@ -7,14 +7,14 @@ import pytest
 from localize_scenes import drive, observed, run_of, town
 
 from rtmap_cli.geometry.poses import wrap_angle, xyyaw_of
-from rtmap_cli.steps.localize.blocks import BlockSystem
-from rtmap_cli.steps.localize.field import frame_basis
-from rtmap_cli.steps.localize.frames import read_detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.drive.blocks import BlockSystem
+from rtmap_cli.steps.localize.drive.motion import STATE, Motion, motion_of, motion_terms, step_error
+from rtmap_cli.steps.localize.frame.single import _field_gram, _solve
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import STATE, Motion, motion_of, motion_terms, step_error
-from rtmap_cli.steps.localize.residuals import judge, linearize, noise_of, place_amplitude
-from rtmap_cli.steps.localize.single import _field_gram, _solve
+from rtmap_cli.steps.localize.seeing.field import frame_basis
+from rtmap_cli.steps.localize.seeing.frames import read_detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import judge, linearize, noise_of, place_amplitude
 
 gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed")
 

@@ -16,13 +16,13 @@ from rtmap_cli.geometry.poses import se3_from_xyyaw, xyyaw_of
 from rtmap_cli.logs.run import Poses, Run, read_poses, write_run
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
-from rtmap_cli.steps.localize.begin import single_frames
-from rtmap_cli.steps.localize.frames import read_detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.drive.motion import motion_of
+from rtmap_cli.steps.localize.frame.begin import single_frames
+from rtmap_cli.steps.localize.lag.window import Window
 from rtmap_cli.steps.localize.localize import localize
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import motion_of
-from rtmap_cli.steps.localize.window import Window
+from rtmap_cli.steps.localize.seeing.frames import read_detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
 
 
 def street(length: float) -> VectorMap:

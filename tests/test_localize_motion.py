@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rtmap_cli.geometry.poses import wrap_angle
-from rtmap_cli.steps.localize.motion import STATE, Motion, motion_terms, step_error
+from rtmap_cli.steps.localize.drive.motion import STATE, Motion, motion_terms, step_error
 
 
 def _motion(count: int, seed: int = 0) -> Motion:

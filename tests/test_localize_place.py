@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 from localize_scenes import drive, observed, run_of, town
 
-from rtmap_cli.steps.localize.field import GridField
-from rtmap_cli.steps.localize.frames import read_detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.drive.motion import STATE
+from rtmap_cli.steps.localize.drive.place import PlaceField, _births
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import STATE
-from rtmap_cli.steps.localize.place import PlaceField, _births
-from rtmap_cli.steps.localize.residuals import linearize
+from rtmap_cli.steps.localize.seeing.field import GridField
+from rtmap_cli.steps.localize.seeing.frames import read_detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import linearize
 
 MODEL, SETTINGS = ErrorModel(), Settings()
 

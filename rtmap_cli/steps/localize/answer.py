@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.poses import yaw_of
 from rtmap_cli.logs.run import Poses, RunFrames
+from rtmap_cli.steps.localize.frame.single import Solution
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.single import Solution
 
 Array = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from rtmap_cli.logs.residuals import Residuals
 from rtmap_cli.logs.run import Run
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.residuals import judge, linearize, noise_of
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import judge, linearize, noise_of
 
 Array = NDArray[np.float64]
 

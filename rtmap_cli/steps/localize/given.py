@@ -12,7 +12,7 @@ from rtmap_cli.geometry.poses import wrap_angle, xyyaw_of
 from rtmap_cli.logs.run import MATCHED, OUTDATED, Run
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.localize.answer import lift
-from rtmap_cli.steps.localize.single import Solution
+from rtmap_cli.steps.localize.frame.single import Solution
 
 Array = NDArray[np.float64]
 

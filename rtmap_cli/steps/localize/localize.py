@@ -16,18 +16,18 @@ from rtmap_cli.logs.run import Poses, Run, RunFrames
 from rtmap_cli.maps.crs import check_same_crs
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.localize.answer import poses_of
-from rtmap_cli.steps.localize.begin import single_frames
+from rtmap_cli.steps.localize.drive.motion import motion_of
+from rtmap_cli.steps.localize.drive.smooth import solve_smooth
 from rtmap_cli.steps.localize.explain import residuals_at
-from rtmap_cli.steps.localize.frames import Detections, has_matches, read_detections
+from rtmap_cli.steps.localize.frame.begin import single_frames
+from rtmap_cli.steps.localize.frame.single import Solution
 from rtmap_cli.steps.localize.given import Rest, known_end_to_end, start_of, with_prior
 from rtmap_cli.steps.localize.heights import with_heights
-from rtmap_cli.steps.localize.lines import MapLines
-from rtmap_cli.steps.localize.live import solve_live
+from rtmap_cli.steps.localize.lag.live import solve_live
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import motion_of
 from rtmap_cli.steps.localize.relocate import Found, Reach, moved, relocate, widened
-from rtmap_cli.steps.localize.single import Solution
-from rtmap_cli.steps.localize.smooth import solve_smooth
+from rtmap_cli.steps.localize.seeing.frames import Detections, has_matches, read_detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
 
 Array = NDArray[np.float64]
 

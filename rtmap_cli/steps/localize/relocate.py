@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.poses import wrap_angle
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.lines import MapLines
-from rtmap_cli.steps.localize.motion import Motion
-from rtmap_cli.steps.localize.single import Solution
+from rtmap_cli.steps.localize.drive.motion import Motion
+from rtmap_cli.steps.localize.frame.single import Solution
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

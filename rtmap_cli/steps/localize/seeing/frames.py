@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from rtmap_cli.geometry.poses import xyyaw_of
 from rtmap_cli.logs.run import MATCHED, OUTDATED, Observations, Run
 from rtmap_cli.maps.element import RING_CLASSES
-from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import Settings
+from rtmap_cli.steps.localize.seeing.lines import MapLines
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -8,13 +8,13 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.steps.localize.blocks import BlockSystem
-from rtmap_cli.steps.localize.field import GridField
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.drive.blocks import BlockSystem
+from rtmap_cli.steps.localize.drive.motion import STATE
 from rtmap_cli.steps.localize.model import ErrorModel
-from rtmap_cli.steps.localize.motion import STATE
-from rtmap_cli.steps.localize.residuals import Linear, gram_sum, place_amplitude
+from rtmap_cli.steps.localize.seeing.field import GridField
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import Linear, gram_sum, place_amplitude
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

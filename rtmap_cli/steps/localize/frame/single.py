@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.poses import wrap_angle
-from rtmap_cli.steps.localize.field import frame_basis
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.residuals import (
+from rtmap_cli.steps.localize.seeing.field import frame_basis
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import (
     Linear,
     common_offset,
     gram,

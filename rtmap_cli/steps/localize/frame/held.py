@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.poses import wrap_angle
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.residuals import Linear, Noise, woodbury_root
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.residuals import Linear, Noise, woodbury_root
 
 Array = NDArray[np.float64]
 

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.poses import wrap_angle
-from rtmap_cli.steps.localize.blocks import BlockSystem
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.drive.blocks import BlockSystem
+from rtmap_cli.steps.localize.drive.motion import STATE, Motion, motion_terms
+from rtmap_cli.steps.localize.drive.place import PlaceField
+from rtmap_cli.steps.localize.frame.single import Solution
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import STATE, Motion, motion_terms
-from rtmap_cli.steps.localize.place import PlaceField
-from rtmap_cli.steps.localize.residuals import Noise, judge, linearize, noise_of
-from rtmap_cli.steps.localize.single import Solution
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import Noise, judge, linearize, noise_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

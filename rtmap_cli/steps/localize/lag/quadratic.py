@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.steps.localize.field import GridField
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.drive.smooth import shares_of
 from rtmap_cli.steps.localize.model import ErrorModel
-from rtmap_cli.steps.localize.residuals import (
+from rtmap_cli.steps.localize.seeing.field import GridField
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import (
     Linear,
     gram_sum,
     judge,
@@ -19,7 +20,6 @@ from rtmap_cli.steps.localize.residuals import (
     noise_of,
     place_amplitude,
 )
-from rtmap_cli.steps.localize.smooth import shares_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

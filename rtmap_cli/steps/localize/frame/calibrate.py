@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.frame.single import Solution
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.residuals import Linear, linearize
-from rtmap_cli.steps.localize.single import Solution
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import Linear, linearize
 
 Array = NDArray[np.float64]
 

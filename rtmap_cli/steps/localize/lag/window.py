@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from rtmap_cli.geometry.poses import wrap_angle
-from rtmap_cli.steps.localize.blocks import BlockSystem
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.drive.blocks import BlockSystem
+from rtmap_cli.steps.localize.drive.motion import STATE, Motion, motion_terms
+from rtmap_cli.steps.localize.drive.smooth import chunks, first_poses
+from rtmap_cli.steps.localize.frame.single import Solution
+from rtmap_cli.steps.localize.lag.quadratic import Bumps, FrameTerms, Group, frame_terms, picked
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import STATE, Motion, motion_terms
-from rtmap_cli.steps.localize.quadratic import Bumps, FrameTerms, Group, frame_terms, picked
-from rtmap_cli.steps.localize.residuals import judge, linearize, noise_of
-from rtmap_cli.steps.localize.single import Solution
-from rtmap_cli.steps.localize.smooth import chunks, first_poses
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
+from rtmap_cli.steps.localize.seeing.residuals import judge, linearize, noise_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

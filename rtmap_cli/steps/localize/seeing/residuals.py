@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.lines import MapLines
 from rtmap_cli.steps.localize.model import ErrorModel
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
 
 Array = NDArray[np.float64]
 

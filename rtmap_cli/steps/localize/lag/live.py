@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.logs.run import RunFrames
-from rtmap_cli.steps.localize.begin import single_frames
-from rtmap_cli.steps.localize.calibrate import calibrated
-from rtmap_cli.steps.localize.frames import Detections
-from rtmap_cli.steps.localize.lines import MapLines
+from rtmap_cli.steps.localize.drive.motion import motion_of
+from rtmap_cli.steps.localize.frame.begin import single_frames
+from rtmap_cli.steps.localize.frame.calibrate import calibrated
+from rtmap_cli.steps.localize.frame.single import Solution, solve_single
+from rtmap_cli.steps.localize.lag.window import Window
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
-from rtmap_cli.steps.localize.motion import motion_of
-from rtmap_cli.steps.localize.single import Solution, solve_single
-from rtmap_cli.steps.localize.window import Window
+from rtmap_cli.steps.localize.seeing.frames import Detections
+from rtmap_cli.steps.localize.seeing.lines import MapLines
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -1,0 +1,1 @@
+"""A whole drive at once: motion, the field of place errors, the block solver."""

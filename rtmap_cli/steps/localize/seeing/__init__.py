@@ -1,0 +1,1 @@
+"""What a run sees and a map has, brought together: vertices, lines, residuals, their errors."""
