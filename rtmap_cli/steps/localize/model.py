@@ -29,10 +29,12 @@ class ErrorModel:
     # Travel over which an element's own offset persists from frame to frame.
     element_length_m: float = 15.0
     # The map's own error: per axis where the map states none, its correlation length along a line,
-    # and the travel during which one error of it stays in range.
+    # and the travel over which one error of it counts once: for detections, and for answers to
+    # prior queries, which take along the error of what they were asked about while it is in range.
     map_sigma_m: float = 0.1
     map_length_m: float = 12.0
     map_persist_m: float = 15.0
+    asked_persist_m: float = 50.0
     # Constant error of the rig's calibration along and across the vehicle (a pitch of the cameras
     # moves what they see along it), and its turn: no drive can show them.
     rig_sigma_m: tuple[float, float] = (0.08, 0.03)

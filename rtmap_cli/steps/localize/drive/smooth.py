@@ -105,11 +105,12 @@ def shares_of(seen: Detections, spacing: Array, model: ErrorModel) -> Shares:
     asked = seen.chain >= 0
     repeats = np.clip(model.element_length_m / between, 1.0, _MOST_REPEATS)
     of_asked = np.minimum(2.0 * repeats, _MOST_REPEATS)
+    persist = np.where(asked, model.asked_persist_m, model.map_persist_m)
     return Shares(
         judged=model.element_share + _FIELD_DOUBT * model.place_share,
         solved=model.element_share * np.where(asked, of_asked, 1.0),
         stated=model.element_share * np.where(asked, of_asked, np.maximum(_FADING * repeats, 1.0)),
-        map_repeats=np.clip(model.map_persist_m / between, 1.0, _MOST_REPEATS),
+        map_repeats=np.clip(persist / between, 1.0, _MOST_REPEATS),
     )
 
 
