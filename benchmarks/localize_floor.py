@@ -13,18 +13,13 @@ bound sqrt(2/pi) times its standard deviation. One JSON object per kind of drive
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from localize_robust import KINDS, PRIOR_SIGMA, Case, cases, errors
+from localize_robust import KINDS, PRIOR_SIGMA, Case, cases, errors, parser_of, places_of
 from numpy.typing import NDArray
-from paper_places import av2_places, town_places
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from rtmap_cli.geometry.poses import xyyaw_of
@@ -210,15 +205,8 @@ def bounds_of(case: Case, preset: Preset) -> dict[str, Array]:
 
 def main() -> None:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=os.environ.get("RTMAP_DATA"))
-    parser.add_argument("--towns", action="store_true", help="simulated towns, not real maps")
-    parser.add_argument("--drives", type=int, default=3, help="per map and kind")
-    parser.add_argument("--seed", type=int, default=1)
-    a = parser.parse_args()
-    if a.data is None and not a.towns:
-        sys.exit("sample data folder not found, set RTMAP_DATA or pass --towns")
-    places = town_places() if a.towns else av2_places(Path(a.data))
+    a = parser_of(__doc__.splitlines()[0]).parse_args()
+    places = places_of(a)
     for kind in KINDS:
         found: dict[str, list[Array]] = {}
         for case in cases(places, kind, a.drives, a.seed):

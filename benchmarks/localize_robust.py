@@ -181,18 +181,29 @@ def measure(places: list[Place], kind: str, smooth: bool, a: argparse.Namespace)
     }), flush=True)  # fmt: skip
 
 
-def main() -> None:
-    """Parse the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def parser_of(description: str) -> argparse.ArgumentParser:
+    """The options that say where and how often to drive."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--data", type=Path, default=os.environ.get("RTMAP_DATA"))
     parser.add_argument("--towns", action="store_true", help="simulated towns, not real maps")
     parser.add_argument("--drives", type=int, default=3, help="per map and kind")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
-    a = parser.parse_args()
+    return parser
+
+
+def places_of(a: argparse.Namespace) -> list[Place]:
+    """The places that the options name; SystemExit when there are none."""
     if a.data is None and not a.towns:
         sys.exit("sample data folder not found, set RTMAP_DATA or pass --towns")
-    places = town_places() if a.towns else av2_places(Path(a.data))
+    return town_places() if a.towns else av2_places(Path(a.data))
+
+
+def main() -> None:
+    """Parse the command line."""
+    parser = parser_of(__doc__.splitlines()[0])
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    a = parser.parse_args()
+    places = places_of(a)
     for kind in a.kinds:
         for smooth in (False, True):
             measure(places, kind, smooth, a)

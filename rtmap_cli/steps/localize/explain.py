@@ -10,7 +10,7 @@ from rtmap_cli.logs.run import Run
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
 from rtmap_cli.steps.localize.seeing.frames import Detections
 from rtmap_cli.steps.localize.seeing.lines import MapLines
-from rtmap_cli.steps.localize.seeing.residuals import judge, linearize, noise_of
+from rtmap_cli.steps.localize.seeing.residuals import judge, linearize, noise_of, turn_of
 
 Array = NDArray[np.float64]
 
@@ -23,14 +23,12 @@ def residuals_at(
     model: ErrorModel,
     settings: Settings,
 ) -> Residuals:
-    """The residuals at ``pose`` (T, 3), as the last round of a single frame weighs them."""
+    """The residuals at ``pose`` (T, 3) to the lines nearest there, weighed as in single frames."""
     linear = linearize(lines, seen, pose, settings.gates_m[-1])
     noise = noise_of(lines, seen, linear, model, model.offset_share)
     judgement = judge(seen, linear, noise, linear.r, model, settings.huber)
     count = seen.points.shape[1]
-    c, s = np.cos(pose[seen.frame, 2]), np.sin(pose[seen.frame, 2])
-    turn = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], -2)
-    at = seen.points @ turn + pose[seen.frame, None, :2] + lines.origin
+    at = seen.points @ turn_of(seen, pose) + pose[seen.frame, None, :2] + lines.origin
     found = linear.found.ravel()
     vertex = 1.0 / np.where(linear.found, noise.weight, 1.0)
     sigma = np.sqrt(vertex + (noise.shared**2).sum(-1)).ravel()
