@@ -9,6 +9,7 @@ from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, wrap_angle, xyyaw_o
 from rtmap_cli.logs.run import MATCHED, NEW, Observations, Run, RunFrames, run_info
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
+from rtmap_cli.steps.localize.seeing.residuals import gram_sum
 
 CRS = "EPSG:32632"
 CENTRE = np.array([500_000.0, 5_300_000.0])
@@ -115,3 +116,9 @@ def run_of(
 def error_of(pose: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """(T, 3) longitudinal, lateral (m) and yaw (rad) errors."""
     return xyyaw_of(invert(truth) @ pose)
+
+
+def gram(columns: np.ndarray, weight: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    """Xᵀ C⁻¹ X (E, q, q) of every element by itself."""
+    parts = zip(columns[:, None], weight[:, None], shared[:, None], strict=True)
+    return np.stack([gram_sum(*part) for part in parts])

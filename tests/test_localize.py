@@ -12,6 +12,7 @@ from localize_scenes import (
     CRS,
     drive,
     error_of,
+    gram,
     observed,
     run_of,
     straight_road,
@@ -33,7 +34,7 @@ from rtmap_cli.steps.localize.model import ErrorModel, Settings
 from rtmap_cli.steps.localize.seeing.field import GridField, frame_basis
 from rtmap_cli.steps.localize.seeing.frames import read_detections
 from rtmap_cli.steps.localize.seeing.lines import MapLines
-from rtmap_cli.steps.localize.seeing.residuals import gram, gram_sum, linearize, noise_of
+from rtmap_cli.steps.localize.seeing.residuals import gram_sum, linearize, noise_of
 
 MODEL, SETTINGS = ErrorModel(), Settings()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from localize_scenes import drive, observed, run_of, town
+from localize_scenes import drive, gram, observed, run_of, town
 from scipy.optimize import least_squares
 
 from rtmap_cli.steps.localize.frame.held import solve_held
@@ -13,7 +13,7 @@ from rtmap_cli.steps.localize.frame.single import _solve
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
 from rtmap_cli.steps.localize.seeing.frames import read_detections
 from rtmap_cli.steps.localize.seeing.lines import MapLines
-from rtmap_cli.steps.localize.seeing.residuals import gram, judge, linearize, noise_of
+from rtmap_cli.steps.localize.seeing.residuals import judge, linearize, noise_of
 
 MODEL, SETTINGS = ErrorModel(), Settings()
 

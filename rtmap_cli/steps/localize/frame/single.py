@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.poses import wrap_angle
+from rtmap_cli.steps.localize.frame.held import solve_held
 from rtmap_cli.steps.localize.model import ErrorModel, Settings
 from rtmap_cli.steps.localize.seeing.field import frame_basis
 from rtmap_cli.steps.localize.seeing.frames import Detections
@@ -16,7 +17,6 @@ from rtmap_cli.steps.localize.seeing.lines import MapLines
 from rtmap_cli.steps.localize.seeing.residuals import (
     Linear,
     common_offset,
-    gram,
     gram_sum,
     judge,
     linearize,
@@ -156,7 +156,8 @@ def _start_step(
     model: ErrorModel,
     settings: Settings,
 ) -> tuple[Array, Array]:
-    """One Gauss–Newton step with independent elements; the evidence (T,) is that before it."""
+    """The pose with lines and weights held, elements independent; the evidence (T,) is that
+    before it."""
     gate, doubt = rule
     linear = linearize(lines, seen, pose, gate)
     noise = noise_of(lines, seen, linear, model, model.offset_share)
@@ -164,9 +165,7 @@ def _start_step(
     judgement = judge(seen, linear, doubted, linear.r, model, settings.huber)
     information, d = _prior(seen, pose)
     evidence: Array = seen.sum_by_frame(judgement.evidence) - 0.5 * (information * d * d).sum(1)
-    columns = np.concatenate([linear.jacobian, linear.r[..., None]], axis=-1)
-    g = seen.sum_by_frame(gram(columns, judgement.weight(noise), noise.shared))
-    after, _ = _solve(g, seen, pose)
+    after, _ = solve_held(seen, linear, pose, replace(noise, weight=judgement.weight(noise)))
     return after, evidence
 
 

@@ -149,15 +149,9 @@ def woodbury_root(a: Array) -> tuple[Array, Array]:
     return inverse, 2.0 * (np.log(l00) + np.log(l11))
 
 
-def gram(columns: Array, weight: Array, shared: Array) -> Array:
-    """Xᵀ C⁻¹ X (E, q, q) with C = W⁻¹ + U Uᵀ per element, by Woodbury; columns (E, V, q)."""
-    weighted = columns * weight[..., None]
-    b = _root(weight, shared)[0] @ (np.swapaxes(shared, -1, -2) @ weighted)
-    return np.swapaxes(columns, -1, -2) @ weighted - np.swapaxes(b, -1, -2) @ b
-
-
 def gram_sum(columns: Array, weight: Array, shared: Array) -> Array:
-    """The sum of ``gram`` over the elements (q, q), in one product."""
+    """The sum over the elements of Xᵀ C⁻¹ X (q, q), C = W⁻¹ + U Uᵀ, by Woodbury in one product;
+    columns X (E, V, q)."""
     weighted = columns * weight[..., None]
     q = columns.shape[-1]
     b = _root(weight, shared)[0] @ (np.swapaxes(shared, -1, -2) @ weighted)
