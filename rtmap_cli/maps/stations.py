@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -50,10 +51,17 @@ class Stations:
     def __len__(self) -> int:
         return len(self.xy)
 
-    @property
+    @cached_property
     def normal(self) -> Array:
         """(n, 2) unit normals to the left of the tangents."""
         return np.stack([-self.tangent[:, 1], self.tangent[:, 0]], axis=-1)
+
+    @cached_property
+    def tree(self) -> Any:
+        """KD-tree of the stations: all drives ask for it."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.xy)
 
     def of_line(self, k: int) -> Int:
         """Indices of the stations of line ``k`` in order (they lie together)."""
@@ -73,9 +81,17 @@ class Samples:
     covariance: Array
     score: Array
     frame: Int
+    last: list[Any] = field(default_factory=list, repr=False, compare=False)
 
     def __len__(self) -> int:
         return len(self.xy)
+
+    @cached_property
+    def tree(self) -> Any:
+        """KD-tree of the samples: they meet many generations of lines."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.xy)
 
 
 @dataclass(frozen=True)
@@ -205,28 +221,35 @@ def samples_of(points: Array, covariance: Array, score: Array, frame: Int) -> Sa
     )
 
 
-def _candidates(stations: Stations, samples: Samples, gate: float) -> tuple[Int, Int, Array, Array]:
+def candidate_feet(
+    stations: Stations, samples: Samples, gate: float
+) -> tuple[Int, Int, Array, Array]:
     """Best foot of each sample on each chain in reach: sample, station, offset, along."""
-    from scipy.spatial import cKDTree
-
     reach = float(np.hypot(gate, STEP))
-    near = cKDTree(samples.xy).sparse_distance_matrix(
-        cKDTree(stations.xy), reach, output_type="ndarray"
-    )
+    near = samples.tree.sparse_distance_matrix(stations.tree, reach, output_type="ndarray")
     i, j = near["i"].astype(np.int64), near["j"].astype(np.int64)
-    t = stations.tangent[j]
-    aligned = np.abs((samples.tangent[i] * t).sum(-1)) >= MIN_COS
-    i, j, t = i[aligned], j[aligned], t[aligned]
-    d = samples.xy[i] - stations.xy[j]
-    along = (d * t).sum(-1)
-    offset = t[:, 0] * d[:, 1] - t[:, 1] * d[:, 0]
-    ok = (np.abs(offset) <= gate) & (np.abs(along) <= STEP)
+    tx, ty = stations.tangent[:, 0][j], stations.tangent[:, 1][j]
+    dx = samples.xy[:, 0][i] - stations.xy[:, 0][j]
+    dy = samples.xy[:, 1][i] - stations.xy[:, 1][j]
+    along, offset = dx * tx + dy * ty, tx * dy - ty * dx
+    aligned = np.abs(samples.tangent[:, 0][i] * tx + samples.tangent[:, 1][i] * ty) >= MIN_COS
+    ok = np.flatnonzero(aligned & (np.abs(offset) <= gate) & (np.abs(along) <= STEP))
+    if not len(ok):
+        none = np.zeros(0, np.int64)
+        return none, none, np.zeros(0), np.zeros(0)
     i, j, along, offset = i[ok], j[ok], along[ok], offset[ok]
-    order = np.lexsort((j, np.abs(along), stations.chain[j], i))
-    i, j, along, offset = i[order], j[order], along[order], offset[order]
-    first = np.ones(len(i), bool)
-    first[1:] = (i[1:] != i[:-1]) | (stations.chain[j[1:]] != stations.chain[j[:-1]])
-    return i[first], j[first], offset[first], along[first]
+    key = i * (int(stations.chain.max()) + 1) + stations.chain[j]
+    order = np.argsort(key)
+    key = key[order]
+    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+    size = np.diff(np.append(first, len(key)))
+    far = np.abs(along)[order]
+    nearest = far == np.repeat(np.minimum.reduceat(far, first), size)
+    # Of two that are as near the first station counts, whatever the order of the pairs.
+    station = np.where(nearest, j[order], len(stations))
+    best = station == np.repeat(np.minimum.reduceat(station, first), size)
+    k = order[best]
+    return i[k], j[k], offset[k], along[k]
 
 
 def assign(
@@ -236,42 +259,52 @@ def assign(
 
     A detection goes to the chain of lowest mean truncated offset, Σ spacing · (gate − |offset|);
     what that chain does not cover goes to the next one, for ``rounds`` rounds: a detection may
-    run over several lines but no sample counts twice.
+    run over several lines but no sample counts twice. The last answer is remembered.
     """
+    if samples.last and samples.last[0][0] is stations and samples.last[0][1:] == (gate, rounds):
+        return samples.last[1]
+    found = _assigned(stations, samples, gate, rounds)
+    samples.last[:] = [(stations, gate, rounds), found]
+    return found
+
+
+def _assigned(
+    stations: Stations, samples: Samples, gate: float, rounds: int
+) -> tuple[Feet, NDArray[np.bool_]]:
     taken = np.zeros(len(samples), bool)
     nothing = Feet(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
     if not len(stations) or not len(samples):
         return nothing, taken
-    i, j, offset, along = _candidates(stations, samples, gate)
-    chain = stations.chain[j]
-    detection = samples.detection[i]
+    i, j, offset, along = candidate_feet(stations, samples, gate)
     chains = int(stations.chain.max()) + 1
-    key = detection * chains + chain
-    parts: list[Feet] = []
+    keys, inverse = np.unique(
+        samples.detection[i] * chains + stations.chain[j], return_inverse=True
+    )
+    owner = keys // chains
+    spacing = samples.spacing[i]
+    value = spacing * (gate - np.abs(offset))
+    total = np.bincount(samples.detection, samples.spacing)
+    least = np.minimum(MIN_STRETCH, 0.6 * total[owner])
+    parts: list[Int] = []
     for _ in range(rounds):
-        free = ~taken[i]
-        if not free.any():
+        free = np.flatnonzero(~taken[i])
+        if not len(free):
             break
-        keys, inverse = np.unique(key[free], return_inverse=True)
-        weight = samples.spacing[i[free]]
-        gain = np.bincount(inverse, weight * (gate - np.abs(offset[free])), len(keys))
-        cover = np.bincount(inverse, weight, len(keys))
-        total = np.bincount(samples.detection, samples.spacing, int(samples.detection.max()) + 1)
-        owner = keys // chains
-        enough = cover >= np.minimum(MIN_STRETCH, 0.6 * total[owner])
+        gain = np.bincount(inverse[free], value[free], len(keys))
+        cover = np.bincount(inverse[free], spacing[free], len(keys))
+        enough = (cover >= least) & (cover > 0)
         order = np.lexsort((keys, -np.where(enough, gain, -1.0), owner))
         best = np.zeros(len(keys), bool)
         best[order] = np.concatenate([[True], owner[order][1:] != owner[order][:-1]])
-        chosen = (best & enough)[inverse]
-        index = np.flatnonzero(free)[chosen]
+        index = free[(best & enough)[inverse[free]]]
         if not len(index):
             break
-        parts.append(Feet(i[index], j[index], offset[index], along[index]))
+        parts.append(index)
         taken[i[index]] = True
     if not parts:
         return nothing, taken
-    names = ("sample", "station", "offset", "along")
-    return Feet(*(np.concatenate([getattr(p, n) for p in parts]) for n in names)), taken
+    k = np.concatenate(parts)
+    return Feet(i[k], j[k], offset[k], along[k]), taken
 
 
 def loose_stretches(samples: Samples, taken: NDArray[np.bool_], shortest: float) -> Int:
@@ -292,9 +325,8 @@ def smoother(stations: Stations, width: float) -> Any:
     directions do not mix (the two sides of a narrow island).
     """
     from scipy.sparse import coo_matrix
-    from scipy.spatial import cKDTree
 
-    tree = cKDTree(stations.xy)
+    tree = stations.tree
     near = tree.sparse_distance_matrix(tree, 3 * width, output_type="coo_matrix")
     i, j = near.row, near.col
     same = stations.chain[i] == stations.chain[j]
