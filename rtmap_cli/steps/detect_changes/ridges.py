@@ -89,61 +89,96 @@ def trace(points: RidgePoints, high: float, shortest: float) -> list[Array]:
     A line starts at ``high`` or more and goes on to the edge of the points; lines shorter than
     ``shortest`` (m) are dropped. A line that runs into another ends there.
     """
-    where = {(int(x), int(y)): k for k, (x, y) in enumerate(points.cell)}
-    owner = np.full(len(points), -1)
+    links = _links(points)
+    owner = [-1] * len(points)
     lines: list[Array] = []
-    for seed in np.lexsort((points.cell[:, 1], points.cell[:, 0], -points.value)):
-        if points.value[seed] < high:
-            break
+    seeds = np.lexsort((points.cell[:, 1], points.cell[:, 0], -points.value))
+    for name, seed in enumerate(seeds[points.value[seeds] >= high].tolist()):
         if owner[seed] >= 0:
             continue
-        owner[seed] = len(lines)
-        ahead = _walk(points, where, owner, int(seed), points.direction[seed], len(lines))
-        behind = _walk(points, where, owner, int(seed), -points.direction[seed], len(lines))
-        line = _smooth(points.xy[[*behind[::-1], int(seed), *ahead]])
+        owner[seed] = name
+        ahead = _walk(links, owner, seed, 0, name)
+        behind = _walk(links, owner, seed, 1, name)
+        raw = points.xy[[*behind[::-1], seed, *ahead]]
+        # Most are specks; what follows makes lines a little shorter or longer, not twice as long.
+        if length(raw) < 0.5 * shortest:
+            continue
+        line = _smooth(raw)
         line = _straight_end(_straight_end(line)[::-1])[::-1]
         lines.append(line)
     return [line for line in lines if len(line) > 1 and length(line) >= shortest]
 
 
-_NEAR = [(x, y) for x in range(-2, 3) for y in range(-2, 3) if (x, y) != (0, 0)]
+@dataclass(frozen=True)
+class _Links:
+    """Where a walk may go from point k along its direction (side 0) or against it (side 1):
+    ``onward[side][first[side][k]:first[side][k + 1]]``, the best one first; ``turned`` says
+    whether the next point's own direction runs against the walk. ``beside`` likewise: what lies
+    beside a step from k and belongs to the same ridge."""
+
+    onward: tuple[list[int], list[int]]
+    turned: tuple[list[bool], list[bool]]
+    first: tuple[list[int], list[int]]
+    beside: list[int]
+    beside_first: list[int]
 
 
-def _walk(
-    points: RidgePoints,
-    where: dict[tuple[int, int], int],
-    owner: Int,
-    start: int,
-    direction: Array,
-    name: int,
-) -> list[int]:
-    """Indices of the ridge points that follow ``start`` in ``direction``."""
+def _links(points: RidgePoints) -> _Links:
+    """Neighbours within two cells, judged from every point in both directions at once."""
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(points.cell).query_pairs(2.0, p=np.inf, output_type="ndarray")
+    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+    step, d = points.xy[j] - points.xy[i], points.direction[i]
+    forward = step[:, 0] * d[:, 0] + step[:, 1] * d[:, 1]
+    across = np.abs(step[:, 0] * d[:, 1] - step[:, 1] * d[:, 0])
+    cosine = (points.direction[j] * d).sum(axis=1)
+    turn = np.abs(cosine)
+    n = len(points)
+    onward, turned, first = [], [], []
+    for sign in (1.0, -1.0):
+        ahead = sign * forward
+        k = np.flatnonzero((ahead > 0) & (across < 1.2 * ahead) & (turn > 0.6))
+        cost = ahead[k] + 2 * across[k] + (1 - turn[k])
+        cell = points.cell[j[k]]
+        k = k[np.lexsort((cell[:, 1], cell[:, 0], cost, i[k]))]
+        onward.append(j[k].tolist())
+        turned.append((cosine[k] <= 0).tolist())
+        first.append(np.searchsorted(i[k], np.arange(n + 1)).tolist())
+    k = np.flatnonzero((np.abs(forward) <= across) & (turn > 0.8))
+    k = k[np.argsort(i[k], kind="stable")]
+    return _Links(
+        (onward[0], onward[1]),
+        (turned[0], turned[1]),
+        (first[0], first[1]),
+        j[k].tolist(),
+        np.searchsorted(i[k], np.arange(n + 1)).tolist(),
+    )
+
+
+def _walk(links: _Links, owner: list[int], start: int, side: int, name: int) -> list[int]:
+    """Indices of the ridge points that follow ``start`` on one side of it."""
     path: list[int] = []
-    here, d = start, direction
+    here = start
     while True:
-        x, y = points.cell[here]
-        found = [k for dx, dy in _NEAR if (k := where.get((int(x) + dx, int(y) + dy))) is not None]
-        if not found:
+        at, stop = links.first[side][here], links.first[side][here + 1]
+        onward = links.onward[side]
+        while at < stop and owner[onward[at]] == name:
+            at += 1
+        if at == stop:
             return path
-        index = np.array(found)
-        step = points.xy[index] - points.xy[here]
-        forward = step @ d
-        beside = np.abs(step[:, 0] * d[1] - step[:, 1] * d[0])
-        turn = np.abs(points.direction[index] @ d)
-        ok = (forward > 0) & (beside < 1.2 * forward) & (turn > 0.6) & (owner[index] != name)
-        if not ok.any():
-            return path
-        cost = np.where(ok, forward + 2 * beside + (1 - turn), np.inf)
-        nearest = int(index[cost.argmin()])
-        # What lies beside the step belongs to the same ridge: it must not start a line.
-        swallowed = index[(np.abs(forward) <= beside) & (turn > 0.8) & (owner[index] < 0)]
+        nearest = onward[at]
         path.append(nearest)
         if owner[nearest] >= 0:
             return path
-        owner[swallowed] = name
+        # What lies beside the step belongs to the same ridge: it must not start a line.
+        for k in links.beside[links.beside_first[here] : links.beside_first[here + 1]]:
+            if owner[k] < 0:
+                owner[k] = name
         owner[nearest] = name
-        sign = 1.0 if points.direction[nearest] @ d > 0 else -1.0
-        here, d = nearest, sign * points.direction[nearest]
+        # The direction of a point has no sign of its own: the walk goes on the way it came.
+        side ^= links.turned[side][at]
+        here = nearest
 
 
 def _smooth(line: Array, sigma: float = 2.0) -> Array:
