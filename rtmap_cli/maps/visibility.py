@@ -36,27 +36,55 @@ def hidden(points: Array, boxes: Array) -> NDArray[np.bool_]:
     """(n,) True where the line of sight from the ego origin meets a box before the point or in it.
 
     ``points`` (n, 2) and ``boxes`` (k, 5: x, y, yaw, length, width) in the ego frame, metres.
-    Slab test of the segment origin → point in each box's own frame; a box around the origin (the
-    vehicle itself) hides nothing.
+    A box around the origin (the vehicle itself) hides nothing.
     """
-    if not len(boxes) or not len(points):
-        return np.zeros(len(points), bool)
-    c, s = np.cos(boxes[:, 2]), np.sin(boxes[:, 2])
-    half = boxes[:, 3:5] / 2
-    # Origin and directions in the frames of the boxes: (k, 2) and (k, n, 2).
-    ox = -(c * boxes[:, 0] + s * boxes[:, 1])
-    oy = -(-s * boxes[:, 0] + c * boxes[:, 1])
-    dx = c[:, None] * points[:, 0] + s[:, None] * points[:, 1]
-    dy = -s[:, None] * points[:, 0] + c[:, None] * points[:, 1]
-    enter, leave = np.zeros(dx.shape), np.ones(dx.shape)
-    for origin, step, size in ((ox, dx, half[:, 0]), (oy, dy, half[:, 1])):
+    return hidden_in_frames(points, np.zeros(len(points), np.int64), [boxes])
+
+
+def hidden_in_frames(points: Array, frame: Int, boxes: Sequence[Array]) -> NDArray[np.bool_]:
+    """``hidden`` for points of several frames, each with its own boxes: (n,) ``frame`` says whose.
+
+    Slab test of the segment origin → point in each box's own frame, for the segments that meet the
+    circle around the box.
+    """
+    out = np.zeros(len(points), bool)
+    most = max((len(b) for b in boxes), default=0)
+    if not most or not len(points):
+        return out
+    # Missing boxes are NaN, which is near nothing.
+    table = np.full((len(boxes), most, 5), np.nan)
+    for k, own in enumerate(boxes):
+        table[k, : len(own)] = own
+    radius = np.hypot(table[..., 3], table[..., 4]) / 2 + 1e-6
+    nearest = np.maximum(np.hypot(table[..., 0], table[..., 1]) - radius, 0.0) ** 2
+    cx, cy = table[..., 0][frame], table[..., 1][frame]
+    px, py = points[:, :1], points[:, 1:]
+    square = px * px + py * py
+    near = (px * cy - py * cx) ** 2 <= square * (radius**2)[frame]
+    near &= (square >= nearest[frame]) & (px * cx + py * cy > -radius[frame] * np.sqrt(square))
+    n, k = np.nonzero(near)
+    blocked = _meets(points[n], table[frame[n], k])
+    out[n[blocked]] = True
+    return out
+
+
+def _meets(points: Array, boxes: Array) -> NDArray[np.bool_]:
+    """(n,) whether the segment from the origin to each point meets its box (n, 5)."""
+    x, y = boxes[:, 0], boxes[:, 1]
+    c, s, half = np.cos(boxes[:, 2]), np.sin(boxes[:, 2]), boxes[:, 3:5] / 2
+    px, py = points[:, 0], points[:, 1]
+    enter, leave = np.zeros(len(points)), np.ones(len(points))
+    around = np.ones(len(points), bool)
+    for origin, step, size in (
+        (-(c * x + s * y), c * px + s * py, half[:, 0]),
+        (s * x - c * y, c * py - s * px, half[:, 1]),
+    ):
         step = np.where(np.abs(step) < 1e-12, 1e-12, step)
-        a = (-size - origin)[:, None] / step
-        b = (size - origin)[:, None] / step
-        enter = np.maximum(enter, np.minimum(a, b))
-        leave = np.minimum(leave, np.maximum(a, b))
-    around = (np.abs(ox) <= half[:, 0]) & (np.abs(oy) <= half[:, 1])
-    return np.asarray(((enter <= leave) & ~around[:, None]).any(axis=0), np.bool_)
+        one, other = (-size - origin) / step, (size - origin) / step
+        enter = np.maximum(enter, np.minimum(one, other))
+        leave = np.minimum(leave, np.maximum(one, other))
+        around &= np.abs(origin) <= size
+    return np.asarray((enter <= leave) & ~around, np.bool_)
 
 
 def in_sectors(points: Array, sectors: Sectors) -> NDArray[np.bool_]:
@@ -96,20 +124,42 @@ def views(
     middles = pose[:, :2] + np.stack(
         [c * centre[0] - s * centre[1], s * centre[0] + c * centre[1]], axis=-1
     )
-    near = cKDTree(points).query_ball_point(middles, reach, return_sorted=True)
+    tree = cKDTree(points)
     frames, which, distances = [], [], []
-    for i, candidates in enumerate(near):
-        index = np.asarray(candidates, np.int64)
-        d = points[index] - pose[i, :2]
-        local = np.stack([c[i] * d[:, 0] + s[i] * d[:, 1], c[i] * d[:, 1] - s[i] * d[:, 0]], -1)
-        ok = ((local >= low) & (local <= high)).all(axis=1)
-        if sectors is not None:
-            ok &= in_sectors(local, sectors)
-        index, local = index[ok], local[ok]
-        if occluders is not None and len(occluders[i]) and len(index):
-            clear = ~hidden(local, occluders[i])
-            index, local = index[clear], local[clear]
-        frames.append(np.full(len(index), i, np.int64))
-        which.append(index)
-        distances.append(np.hypot(local[:, 0], local[:, 1]))
+    for group in _groups(middles):
+        first = middles[group.start]
+        room = reach + float(np.hypot(*(middles[group] - first).T).max())
+        index = np.sort(np.asarray(tree.query_ball_point(first, room), np.int64))
+        if not len(index):
+            continue
+        dx = points[index, 0] - pose[group, 0, None]
+        dy = points[index, 1] - pose[group, 1, None]
+        cg, sg = c[group, None], s[group, None]
+        x, y = cg * dx + sg * dy, cg * dy - sg * dx
+        i, k = np.nonzero((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]))
+        local = np.stack([x[i, k], y[i, k]], axis=-1)
+        seen = np.ones(len(i), bool) if sectors is None else in_sectors(local, sectors)
+        if occluders is not None:
+            seen &= ~hidden_in_frames(local, i, occluders[group])
+        frames.append(i[seen] + group.start)
+        which.append(index[k[seen]])
+        distances.append(np.hypot(local[seen, 0], local[seen, 1]))
+    if not frames:
+        return Views(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     return Views(np.concatenate(frames), np.concatenate(which), np.concatenate(distances))
+
+
+TOGETHER, APART = 16, 12.0
+"""At most so many frames, not farther apart (m), look for points together."""
+
+
+def _groups(middles: Array) -> list[slice]:
+    """Frames one after the other that stand near each other."""
+    out, start = [], 0
+    while start < len(middles):
+        part = middles[start : start + TOGETHER]
+        far = np.flatnonzero(np.hypot(*(part - part[0]).T) > APART)
+        stop = start + (int(far[0]) if len(far) else len(part))
+        out.append(slice(start, stop))
+        start = stop
+    return out
