@@ -45,26 +45,33 @@ class Marks:
         return Marks(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
-def deposits(marks: Marks, widest: float = 1.2) -> tuple[Int, Array]:
-    """Cells (n, 2) and masses (n,) of line samples, each N(0, sigma²) across its line.
+BELL = np.linspace(-2.4, 2.4, 17)
+"""Where the bell across a line is laid down, in sigmas."""
+
+
+def deposits(marks: Marks, widest: float = 1.2) -> tuple[Array, Array, Array]:
+    """Places x, y (n, 17) in cells and masses (n, 17) of line samples, each N(0, sigma²) across
+    its line.
 
     Samples farther apart than a cell are repeated along their tangents. ``sigma`` above
     ``widest`` (m) is taken as that: wider bells say nothing and cost most.
     """
-    spacing, tangent = marks.spacing, marks.tangent
+    spacing, tangent = marks.spacing, marks.tangent / CELL
     repeat = np.maximum(np.ceil(spacing / CELL), 1).astype(np.int64)
     row = np.repeat(np.arange(len(spacing)), repeat)
     k = np.arange(len(row)) - np.repeat(np.cumsum(repeat) - repeat, repeat)
     shift = ((k + 0.5) / repeat[row] - 0.5) * spacing[row]
-    p = marks.xy[row] + shift[:, None] * tangent[row]
-    normal = np.stack([-tangent[row, 1], tangent[row, 0]], axis=-1)
-    s = np.clip(marks.sigma[row], CELL, widest)
-    u = np.linspace(-2.4, 2.4, 17)
-    bell = np.exp(-0.5 * u**2)
-    bell /= bell.sum()
-    cell = np.floor((p[:, None] + (s[:, None] * u)[..., None] * normal[:, None]) / CELL)
-    mass = (marks.score[row] * spacing[row] / repeat[row])[:, None] * bell / CELL**2
-    return cell.reshape(-1, 2).astype(np.int64), mass.ravel()
+    s = np.clip(marks.sigma, CELL, widest)
+    x = marks.xy[row, 0] / CELL + shift * tangent[row, 0]
+    y = marks.xy[row, 1] / CELL + shift * tangent[row, 1]
+    across = s * tangent[:, 0], -s * tangent[:, 1]
+    bell = np.exp(-0.5 * BELL**2)
+    mass = (marks.score * spacing / repeat)[row, None] * (bell / bell.sum() / CELL**2)
+    return (
+        x[:, None] + across[1][row, None] * BELL,
+        y[:, None] + across[0][row, None] * BELL,
+        mass,
+    )
 
 
 def _coarse_views(coarse: Int, traversal: Traversal) -> Array:
@@ -105,27 +112,41 @@ def _mean_field(
 ) -> Array:
     """Mean over the drives of deposits per view, (rows y, columns x)."""
     width, height = int(shape[0]), int(shape[1])
+    fields = [_sums(marks, start, width, height) if len(marks.score) else None for marks in drives]
     coarse_shape = (height // COARSE + 2, width // COARSE + 2)
-    total = np.zeros((height, width))
-    weight = np.zeros(coarse_shape)
     base = start // COARSE
     # The squares of the grid need not start with the field: what is left over is cut.
     cut = start - base * COARSE
-    grid = np.stack(np.meshgrid(*(np.arange(n) for n in coarse_shape[::-1])), axis=-1)
-    squares = grid.reshape(-1, 2) + base
-    for marks, traversal in zip(drives, traversals, strict=True):
-        looked = _coarse_views(squares, traversal).reshape(coarse_shape)
+    # Views matter where anything was found only.
+    some = np.zeros((coarse_shape[0] * COARSE, coarse_shape[1] * COARSE), bool)
+    inner = some[cut[1] : cut[1] + height, cut[0] : cut[0] + width]
+    for field in fields:
+        if field is not None:
+            inner |= field > 0
+    used = np.argwhere(some.reshape(coarse_shape[0], COARSE, coarse_shape[1], COARSE).any((1, 3)))
+    total = np.zeros((height, width))
+    weight = np.zeros(coarse_shape)
+    for field, traversal in zip(fields, traversals, strict=True):
+        looked = np.zeros(coarse_shape)
+        looked[used[:, 0], used[:, 1]] = _coarse_views(used[:, ::-1] + base, traversal)
         trust = np.clip((looked - 1) / 3, 0, 1)
         weight += trust
-        if not len(marks.score):
-            continue
-        cell, mass = deposits(marks)
-        x, y = (cell - start).T
-        ok = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-        field = np.bincount(y[ok] * width + x[ok], mass[ok], height * width)
-        scale = _fine(trust / np.maximum(looked, 2.0), cut, height, width)
-        total += field.reshape(height, width) * scale
+        if field is not None:
+            total += field * _fine(trust / np.maximum(looked, 2.0), cut, height, width)
     return total / np.maximum(_fine(weight, cut, height, width), 0.5)
+
+
+def _sums(marks: Marks, start: Int, width: int, height: int) -> Array:
+    """The deposits of one drive summed by cell, (rows y, columns x)."""
+    x, y, mass = deposits(marks)
+    x -= start[0]
+    y -= start[1]
+    ok = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    if not ok.all():
+        x, y, mass = x[ok], y[ok], mass[ok]
+    # What is not negative is cut off as floor does.
+    index = y.astype(np.int64) * width + x.astype(np.int64)
+    return np.bincount(index.ravel(), mass.ravel(), height * width).reshape(height, width)
 
 
 def _fine(coarse: Array, cut: Int, height: int, width: int) -> Array:
