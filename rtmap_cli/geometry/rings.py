@@ -28,16 +28,39 @@ def open_ring(ring: Array, count: int = RING_POINTS) -> Array:
     return out if signed_area(out) >= 0 else out[::-1]
 
 
-def align(ring: Array, reference: Array) -> Array:
-    """``ring`` (n, 2) with its start moved to where it fits ``reference`` (n, 2) best.
+def open_rings(rings: Array, count: int = RING_POINTS) -> Array:
+    """(n, count, 2): ``open_ring`` of rings (n, v, 2) at once."""
+    p = np.asarray(rings, np.float64)[..., :2]
+    if not len(p):
+        return np.zeros((0, count, 2))
+    # A closing segment of no length changes nothing.
+    p = np.concatenate([p, p[:, :1]], axis=1)
+    step = np.hypot(*np.moveaxis(np.diff(p, axis=1), -1, 0))
+    s = np.concatenate([np.zeros((len(p), 1)), np.cumsum(step, axis=1)], axis=1)
+    at = s[:, -1:] * (np.arange(count) / count)
+    segment = (s[:, None, 1:-1] <= at[..., None]).sum(axis=-1)
+    row = np.arange(len(p))[:, None]
+    share = (at - s[row, segment]) / np.maximum(step[row, segment], 1e-12)
+    out = p[row, segment] + share[..., None] * (p[row, segment + 1] - p[row, segment])
+    x, y = out[..., 0] - out[:, :1, 0], out[..., 1] - out[:, :1, 1]
+    area = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
+    turned = area < 0
+    out[turned] = out[turned, ::-1]
+    return out
 
-    The cyclic shift of least squared distance, by circular correlation (FFT); both rings run
+
+def align(rings: Array, reference: Array) -> Array:
+    """``rings`` (..., n, 2), each with its start moved to where it fits ``reference`` (n, 2) best.
+
+    The cyclic shift of least squared distance, by circular correlation (FFT); all rings run
     counter-clockwise.
     """
-    a = (ring - ring.mean(axis=0)) @ np.array([1, 1j])
+    a = (rings - rings.mean(axis=-2, keepdims=True)) @ np.array([1, 1j])
     b = (reference - reference.mean(axis=0)) @ np.array([1, 1j])
-    match = np.fft.ifft(np.fft.fft(a) * np.conj(np.fft.fft(b))).real
-    return np.roll(ring, -int(match.argmax()), axis=0)
+    match = np.fft.ifft(np.fft.fft(a, axis=-1) * np.conj(np.fft.fft(b)), axis=-1).real
+    n = rings.shape[-2]
+    index = (np.arange(n) + match.argmax(axis=-1)[..., None]) % n
+    return np.take_along_axis(rings, index[..., None], axis=-2)
 
 
 def close(ring: Array) -> Array:

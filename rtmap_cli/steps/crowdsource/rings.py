@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.rings import align, close, open_ring, simplified
+from rtmap_cli.geometry.rings import align, close, open_ring, open_rings, simplified
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.refit import SHARPNESS, FusionModel
 from rtmap_cli.steps.crowdsource.lines import LONGEST_MOVE, Fused, columns, planar
@@ -26,7 +26,7 @@ def _drive_mean(
 ) -> tuple[Array, float]:
     """Mean outline of one drive's detections and the variance per axis of its points."""
     weight = score / variance**SHARPNESS
-    aligned = np.stack([align(r, reference) for r in rings])
+    aligned = align(rings, reference)
     mean = (aligned * weight[:, None, None]).sum(0) / weight.sum()
     effective = weight.sum() ** 2 / (weight**2).sum()
     single = float((weight * variance).sum() / weight.sum())
@@ -68,7 +68,7 @@ def fuse_ring(
         index = _near(traversal, class_name, reference)
         if not len(index):
             continue
-        rings = np.stack([open_ring(p) for p in traversal.points[index]])
+        rings = open_rings(traversal.points[index])
         cov = traversal.covariance[index]
         variance = np.maximum((cov[..., 0, 0] + cov[..., 1, 1]).mean(axis=1) / 2, 0.01)
         pose = traversal.pose_covariance[traversal.frame[index]]
@@ -91,10 +91,13 @@ def fuse_ring(
 def _near(traversal: Traversal, class_name: str, reference: Array) -> Int:
     """Whole detections of the class whose centre lies at the element's."""
     mine = np.flatnonzero((traversal.class_name == class_name) & ~traversal.cut)
-    if not len(mine):
-        return mine
-    centres = np.stack([open_ring(p).mean(axis=0) for p in traversal.points[mine]])
-    return mine[np.hypot(*(centres - reference.mean(axis=0)).T) <= NEAR]
+    centre = reference.mean(axis=0)
+    # Nearly all are elsewhere: their outlines need not be drawn to see that.
+    points = traversal.points[mine]
+    size = np.ptp(points, axis=1).max(axis=1, initial=0.0)
+    mine = mine[np.hypot(*(points.mean(axis=1) - centre).T) <= NEAR + size]
+    centres = open_rings(traversal.points[mine]).mean(axis=1)
+    return mine[np.hypot(*(centres - centre).T) <= NEAR]
 
 
 def _moved(

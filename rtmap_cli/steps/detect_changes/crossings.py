@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.rings import RING_POINTS, align, inside, open_ring, overlap, polygon
+from rtmap_cli.geometry.rings import align, open_rings, overlap, polygon
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.refit import SHARPNESS
 from rtmap_cli.maps.visibility import Views, views
@@ -68,8 +69,7 @@ def features(rings: Array) -> Array:
 def class_rings(traversal: Traversal, class_name: str) -> Rings:
     """A drive's detections of a closed class in the map frame."""
     index = np.flatnonzero(traversal.class_name == class_name)
-    rings = [open_ring(p) for p in traversal.points[index]]
-    points = np.array(rings).reshape(len(index), RING_POINTS, 2)
+    points = open_rings(traversal.points[index])
     variance = traversal.covariance[index]
     return Rings(
         points,
@@ -99,17 +99,21 @@ def match(rings: Rings, places: Array, near: float = NEAR) -> Int:
     if not len(left):
         return out
     centres, radius = places.mean(axis=1), np.ptp(places, axis=1).max(axis=1)
-    shapes = [polygon(p) for p in places]
-    for k in left:
-        reach = np.hypot(*(centres - rings.feature[k, :2]).T)
-        close = np.flatnonzero(reach < radius)
-        if not len(close):
-            continue
-        shape = polygon(rings.points[k])
-        shares = [overlap(shape, shapes[j]) for j in close]
-        within = [inside(shape, shapes[j]) for j in close]
-        if max(shares) >= 0.15 or max(within) >= INSIDE:
-            out[k] = close[int(np.argmax(within))]
+    reach = np.hypot(*np.moveaxis(rings.feature[left, None, :2] - centres, -1, 0))
+    k, j = np.nonzero(reach < radius)
+    if not len(k):
+        return out
+    mine = np.array([polygon(p) for p in rings.points[left]], object)[k]
+    theirs = np.array([polygon(p) for p in places], object)[j]
+    common, own, other = shapely.area(np.stack([shapely.intersection(mine, theirs), mine, theirs]))
+    share = common / np.maximum(own + other - common, 1e-12)
+    within = common / np.maximum(own, 1e-12)
+    near = (share >= 0.15) | (within >= INSIDE)
+    some = np.unique(k[near])
+    # Of those that it overlaps it belongs to the one that holds most of it.
+    order = np.lexsort((j, -within, k))
+    first = order[np.searchsorted(k[order], some)]
+    out[left[some]] = j[first]
     return out
 
 
@@ -182,7 +186,7 @@ def _mean(rings: Array, weight: Array) -> Array:
     """Weighted mean ring: aligned to the heaviest one, then to their mean."""
     reference = rings[int(weight.argmax())]
     for _ in range(2):
-        aligned = np.stack([align(r, reference) for r in rings])
+        aligned = align(rings, reference)
         reference = (aligned * weight[:, None, None]).sum(0) / weight.sum()
     return reference
 
