@@ -53,8 +53,8 @@ def hidden_in_frames(points: Array, frame: Int, boxes: Sequence[Array]) -> NDArr
         return out
     # Missing boxes are NaN, which is near nothing.
     table = np.full((len(boxes), most, 5), np.nan)
-    for k, own in enumerate(boxes):
-        table[k, : len(own)] = own
+    for row, own in zip(table, boxes, strict=True):
+        row[: len(own)] = own
     radius = np.hypot(table[..., 3], table[..., 4]) / 2 + 1e-6
     nearest = np.maximum(np.hypot(table[..., 0], table[..., 1]) - radius, 0.0) ** 2
     cx, cy = table[..., 0][frame], table[..., 1][frame]

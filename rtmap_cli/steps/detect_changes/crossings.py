@@ -108,8 +108,8 @@ def match(rings: Rings, places: Array, near: float = NEAR) -> Int:
     common, own, other = shapely.area(np.stack([shapely.intersection(mine, theirs), mine, theirs]))
     share = common / np.maximum(own + other - common, 1e-12)
     within = common / np.maximum(own, 1e-12)
-    near = (share >= 0.15) | (within >= INSIDE)
-    some = np.unique(k[near])
+    meets = np.asarray((share >= 0.15) | (within >= INSIDE), bool)
+    some = np.unique(k[meets])
     # Of those that it overlaps it belongs to the one that holds most of it.
     order = np.lexsort((j, -within, k))
     first = order[np.searchsorted(k[order], some)]

@@ -146,7 +146,8 @@ def _sums(marks: Marks, start: Int, width: int, height: int) -> Array:
         x, y, mass = x[ok], y[ok], mass[ok]
     # What is not negative is cut off as floor does.
     index = y.astype(np.int64) * width + x.astype(np.int64)
-    return np.bincount(index.ravel(), mass.ravel(), height * width).reshape(height, width)
+    out = np.bincount(index.ravel(), mass.ravel(), height * width).astype(np.float64)
+    return out.reshape(height, width)
 
 
 def _fine(coarse: Array, cut: Int, height: int, width: int) -> Array:
