@@ -16,8 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput, UsageError
 
@@ -143,14 +145,24 @@ def refuse_over(output: Path, *inputs: Path) -> None:
 
 
 def write_table(
-    table: pa.Table, path: str | Path, schema: TableSchema, extra: dict[str, str] | None = None
+    table: pa.Table,
+    path: str | Path,
+    schema: TableSchema,
+    extra: dict[str, str] | None = None,
+    group: int | None = None,
 ) -> None:
-    """Write one Parquet file with its schema's name and version; same table → same bytes."""
+    """Write one Parquet file with its schema's name and version; same table → same bytes.
+
+    ``group``: rows of a row group, where readers want some rows of a long table.
+    """
     merged = schema.columns.with_metadata(schema.metadata(extra))
     table = table.select(schema.columns.names).cast(schema.columns)
     with whole_file(path) as temporary:
         pq.write_table(
-            table.replace_schema_metadata(merged.metadata), temporary, compression="zstd"
+            table.replace_schema_metadata(merged.metadata),
+            temporary,
+            compression="zstd",
+            row_group_size=group,
         )
 
 
@@ -173,15 +185,55 @@ def check_schema(
         )
 
 
-def read_table(path: str | Path, schema: TableSchema) -> pa.Table:
-    """Read one Parquet file, checked against ``schema``; BadInput when it cannot be trusted."""
+@dataclass(frozen=True)
+class Only:
+    """The rows whose integer ``column`` holds one of the sorted ``values``."""
+
+    column: str
+    values: NDArray[Any]
+
+    def groups(self, metadata: Any) -> list[int]:
+        """The row groups of a file that may hold such rows, by their statistics."""
+        names = [metadata.schema.column(k).path for k in range(metadata.num_columns)]
+        if self.column not in names:
+            return list(range(metadata.num_row_groups))
+        k, out = names.index(self.column), []
+        for g in range(metadata.num_row_groups):
+            found = metadata.row_group(g).column(k).statistics
+            if found is not None and found.has_min_max:
+                a = np.searchsorted(self.values, found.min, "left")
+                if a >= np.searchsorted(self.values, found.max, "right"):
+                    continue
+            out.append(g)
+        return out
+
+    def of(self, table: pa.Table) -> pa.Table:
+        """The rows of a table."""
+        if self.column not in table.column_names:
+            return table
+        import pyarrow.compute as pc
+
+        column = table[self.column]
+        return table.filter(pc.is_in(column, pa.array(self.values).cast(column.type)))
+
+
+def read_table(path: str | Path, schema: TableSchema, only: Only | None = None) -> pa.Table:
+    """Read one Parquet file, checked against ``schema``; BadInput when it cannot be trusted.
+
+    With ``only`` some rows; row groups that hold none of them are not read.
+    """
     path = Path(path)
     if not path.exists():
         raise BadInput(path, "no such file")
     try:
         with pq.ParquetFile(path) as file:
             # Threads cost more than they bring in small files, of which a map has thousands.
-            table = file.read(use_threads=file.metadata.num_rows > 10_000)
+            threads = file.metadata.num_rows > 10_000
+            if only is None:
+                table = file.read(use_threads=threads)
+            else:
+                groups = only.groups(file.metadata)
+                table = only.of(file.read_row_groups(groups, use_threads=threads))
     except (pa.ArrowException, OSError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadInput(

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from rtmap_cli import __version__
 from rtmap_cli.errors import BadInput
 from rtmap_cli.tables import (
+    Only,
     TableSchema,
     read_json,
     read_table,
@@ -41,6 +42,10 @@ MATCHED, OUTDATED, NEW = range(3)
 
 RUN_SCHEMA = "rtmap.run"
 RUN_VERSION = "1.0"
+
+GROUP = 4096
+"""Rows of a row group: a few hundred frames of observations, so that a stretch of a long run is
+read without the rest."""
 
 _POSE = [("x", pa.float64()), ("y", pa.float64()), ("z", pa.float64())] + [
     (name, pa.float64()) for name in ("qw", "qx", "qy", "qz")
@@ -364,13 +369,13 @@ def write_frames(frames: RunFrames, folder: Path, crs: str) -> None:
     columns |= {f"te_{n}": frames.end_to_end[:, k] for k, n in enumerate(("x", "y", "yaw"))}
     columns["te_covariance"] = _lists(frames.end_to_end_covariance, pa.float64())
     columns["camera_count"] = frames.camera_count
-    write_table(pa.table(columns), folder / "frames.parquet", FRAMES, {"rtmap.crs": crs})
+    write_table(pa.table(columns), folder / "frames.parquet", FRAMES, {"rtmap.crs": crs}, GROUP)
 
 
-def read_frames(folder: Path) -> RunFrames:
-    """Read frames.parquet."""
+def read_frames(folder: Path, only: Only | None = None) -> RunFrames:
+    """Read frames.parquet, or ``only`` some of its rows."""
     path = folder / "frames.parquet"
-    table = read_table(path, FRAMES)
+    table = read_table(path, FRAMES, only)
     times = _column(table, "timestamp_ns").astype(np.int64)
     if (np.diff(times) < 0).any():
         raise BadInput(path, "frames are not sorted by time", "sort them and write it again")
@@ -405,15 +410,15 @@ def write_observations(observations: Observations, folder: Path, crs: str) -> No
         "sigma": _lists(o.sigma, pa.float32()),
         "prior_points": _lists(o.prior_points, pa.float64()),
     }
-    write_table(
-        pa.table(columns), folder / "observations.parquet", OBSERVATIONS, {"rtmap.crs": crs}
-    )
-
-
-def read_observations(folder: Path) -> Observations:
-    """Read observations.parquet; BadInput when rows have different vertex counts or NaN."""
     path = folder / "observations.parquet"
-    table = read_table(path, OBSERVATIONS)
+    write_table(pa.table(columns), path, OBSERVATIONS, {"rtmap.crs": crs}, GROUP)
+
+
+def read_observations(folder: Path, only: Only | None = None) -> Observations:
+    """Read observations.parquet, or ``only`` some of its rows; BadInput when rows have different
+    vertex counts or NaN."""
+    path = folder / "observations.parquet"
+    table = read_table(path, OBSERVATIONS, only)
     if not len(table):
         return Observations.empty()
     counts = np.unique(_column(table, "vertex_count"))
@@ -463,12 +468,12 @@ def write_poses(poses: Poses, folder: Path, crs: str) -> None:
         "chi2": poses.chi2,
         "status": pa.array(list(poses.status), pa.string()),
     }
-    write_table(pa.table(columns), folder / "poses.parquet", POSES, {"rtmap.crs": crs})
+    write_table(pa.table(columns), folder / "poses.parquet", POSES, {"rtmap.crs": crs}, GROUP)
 
 
-def read_poses(path: Path) -> Poses:
-    """Read a poses.parquet file (of a run, or true poses of a simulated log)."""
-    table = read_table(path, POSES)
+def read_poses(path: Path, only: Only | None = None) -> Poses:
+    """Read a poses.parquet file (of a run, or true poses of a simulated log), or some rows."""
+    table = read_table(path, POSES, only)
     methods = table["method"].to_pylist()
     covariance = _rows(table["covariance"], (6, 6), np.float64)
     spread = covariance[:, range(6), range(6)]
@@ -514,7 +519,8 @@ def write_run(run: Run, folder: Path) -> None:
     write_frames(run.frames, folder, run.crs)
     write_observations(run.observations, folder, run.crs)
     if run.occluders is not None:
-        write_table(run.occluders, folder / "occluders.parquet", OCCLUDERS, {"rtmap.crs": run.crs})
+        path = folder / "occluders.parquet"
+        write_table(run.occluders, path, OCCLUDERS, {"rtmap.crs": run.crs}, GROUP)
     if run.poses is not None:
         write_poses(run.poses, folder, run.crs)
 
@@ -568,17 +574,21 @@ def read_run_info(folder: str | Path) -> dict[str, Any]:
     return info
 
 
-def read_run(folder: str | Path) -> Run:
-    """Read a run folder; poses and occluders are None when absent."""
+def read_run(folder: str | Path, frames: NDArray[Any] | None = None) -> Run:
+    """Read a run folder; poses and occluders are None when absent.
+
+    ``frames``: sorted frame numbers, when only those are wanted.
+    """
     folder = Path(folder)
     info = read_run_info(folder)
+    only = None if frames is None else Only("frame", frames)
     occluders, poses = folder / "occluders.parquet", folder / "poses.parquet"
     return Run(
         info=info,
-        frames=read_frames(folder),
-        observations=read_observations(folder),
-        occluders=read_table(occluders, OCCLUDERS) if occluders.exists() else None,
-        poses=read_poses(poses) if poses.exists() else None,
+        frames=read_frames(folder, only),
+        observations=read_observations(folder, only),
+        occluders=read_table(occluders, OCCLUDERS, only) if occluders.exists() else None,
+        poses=read_poses(poses, only) if poses.exists() else None,
         path=folder,
     )
 

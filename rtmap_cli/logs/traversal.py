@@ -94,7 +94,7 @@ def _occluders(run: Run, rows: dict[int, int], count: int) -> list[Array]:
     return out
 
 
-def _poses(run: Run) -> tuple[NDArray[np.bool_], Array, Array]:
+def usable_poses(run: Run) -> tuple[NDArray[np.bool_], Array, Array]:
     """Which frames have a usable pose, x, y, yaw (m, 3) and its covariance (m, 3, 3)."""
     frames = run.frames
     pose = xyyaw_of(frames.initial)
@@ -140,7 +140,7 @@ def traversal_of(run: Run, min_score: float = FOUND_SCORE) -> Traversal:
     state ``outdated`` are answers about the prior, not detections: they appear in ``asked`` only.
     """
     o = run.observations
-    usable, pose, pose_covariance = _poses(run)
+    usable, pose, pose_covariance = usable_poses(run)
     row = np.full(int(run.frames.frame.max(initial=0)) + 2, -1)
     row[run.frames.frame[usable]] = np.arange(int(usable.sum()))
     known = np.isin(o.frame, run.frames.frame)
