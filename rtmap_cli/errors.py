@@ -32,6 +32,10 @@ class BadInput(RtmapError):
         self.where, self.what, self.todo = str(where), what, todo
         super().__init__(f"{where}: {what}" + (f"; {todo}" if todo else ""))
 
+    def __reduce__(self) -> tuple[type[BadInput], tuple[str, str, str]]:
+        """How it travels from a worker process."""
+        return type(self), (self.where, self.what, self.todo)
+
 
 class NoAnswer(RtmapError):
     """The input is fine but no answer is possible, e.g. a degenerate pose (exit 4)."""

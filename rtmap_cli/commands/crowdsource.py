@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +12,10 @@ import click
 from rtmap_cli import options
 
 if TYPE_CHECKING:
+    from rtmap_cli.logs.tracks import Track
     from rtmap_cli.logs.traversal import Traversal
-    from rtmap_cli.maps.element import VectorMap
+    from rtmap_cli.maps.element import Element, VectorMap
+    from rtmap_cli.steps.crowdsource.crowdsource import Workers
     from rtmap_cli.steps.crowdsource.fuse import Fusion
 
 
@@ -25,6 +29,24 @@ if TYPE_CHECKING:
 @click.option(
     "--without-sigma", is_flag=True, help="Ablation: without U, all detections have the same sigma."
 )
+@click.option(
+    "--tile",
+    type=options.FiniteRange(100),
+    default=512.0,
+    show_default=True,
+    help="Side (m) of the tiles that a large area is cut into; one of them is in memory at once.",
+)
+@click.option(
+    "--jobs", type=click.IntRange(1), default=1, show_default=True, help="Processes to use."
+)
+@click.option(
+    "--engine",
+    type=click.Choice(["local", "dask"]),
+    default="local",
+    show_default=True,
+    help="Where tiles are fused: here, or on a dask.distributed cluster (extra: dask).",
+)
+@click.option("--scheduler", metavar="ADDRESS", help="Of the cluster: tcp://HOST:PORT.")
 @options.as_json
 def command(
     runs_dir: Path,
@@ -34,6 +56,10 @@ def command(
     force: bool,
     skip_bad_runs: bool,
     without_sigma: bool,
+    tile: float,
+    jobs: int,
+    engine: str,
+    scheduler: str | None,
     as_json: bool,
 ) -> None:
     """Fuse the runs of RUNS_DIR that the map does not know yet, and commit its next version.
@@ -49,21 +75,34 @@ def command(
       rtmap crowdsource runs --map map --message "week 12"
     """
     from rtmap_cli.errors import NoAnswer
-    from rtmap_cli.logs.agreement import warning
-    from rtmap_cli.logs.traversal import same_sigma
-    from rtmap_cli.maps.store import commit_map, fused_runs, map_exists, read_map, write_new_map
+    from rtmap_cli.logs.agreement import warning_of
+    from rtmap_cli.logs.tracks import read_tracks
+    from rtmap_cli.logs.traversal import find_runs
+    from rtmap_cli.maps.store import fused_runs, map_exists, read_map
     from rtmap_cli.output import emit, log
+    from rtmap_cli.steps.crowdsource.crowdsource import Task, crowdsource
 
+    workers = _workers(jobs, engine, scheduler)
     exists = map_exists(map_path)
     before = read_map(map_path) if exists else None
     known = fused_runs(map_path) if exists else set()
-    paths, traversals, crs, bad = _read(runs_dir, before.crs if before else None, skip_bad_runs)
-    if without_sigma:
-        traversals = [same_sigma(t) for t in traversals]
+    tracks, crs, bad = read_tracks(
+        find_runs(runs_dir), before.crs if before else None, skip_bad_runs
+    )
+    done = set() if force else known & {t.run_id for t in tracks}
+    anew = before is not None and not force and _rebuildable(map_path, known, tracks)
+    task = Task(before, crs, frozenset(done), anew, without_sigma, tile)
+    fresh = [t for t in tracks if t.run_id not in done]
+    _tell_unlocalized([t.run_id for t in fresh if not t.localized], exists)
+    fusion = None
+    if fresh:
+        found = crowdsource(task, tracks, fuse_region, workers, skip_bad_runs)
+        fusion, bad = found.fusion, bad + found.bad
+        fresh = [t for t in found.tracks if t.run_id not in done]
+        if doubt := warning_of(found.agreements, map_path):
+            log(doubt)
     for line in bad:
         log(f"left out: {line}")
-    done = set() if force else known & {t.run_id for t in traversals}
-    fresh = [t for t in traversals if t.run_id not in done]
     result: dict[str, Any] = {
         "map": str(map_path),
         "base_version": before.version if before else None,
@@ -73,95 +112,71 @@ def command(
         "bad_runs": bad,
         "dry_run": dry_run,
     }
-    if not fresh:
+    if fusion is None:
         emit(result | {"counts": {}}, as_json, [f"{map_path}: all runs are in the map already"])
         return
-    _tell_unlocalized([t.run_id for t in fresh if not t.localized], exists)
-    if before is not None and (doubt := warning(fresh, before, map_path)):
-        log(doubt)
-    if before is not None and not force and _rebuildable(map_path, known, traversals):
-        fusion = _rebuilt(traversals, before, crs, paths)
-    else:
-        fusion = _fuse(traversals, fresh, before, crs, paths, done)
     if not len(fusion.vector_map) and not exists:
         raise NoAnswer(f"{runs_dir}: the runs hold nothing that could become a map")
     if not dry_run:
         text = message or f"crowdsource: {len(fresh)} runs"
         names = [t.run_id for t in fresh if t.run_id not in known]
-        info = {"crowdsource": fusion.counts()}
-        if before is None:
-            write_new_map(fusion.vector_map, map_path, text, runs=names, info=info)
-            result["version"] = 0
-        else:
-            assert before.version is not None
-            result["version"] = commit_map(
-                map_path, fusion.vector_map, before.version, text, runs=names, info=info
-            )
+        result["version"] = _committed(map_path, before, fusion, text, names)
     emit(_described(result, fusion), as_json, _lines(result, fusion))
 
 
-def _read(
-    runs_dir: Path, crs: str | None, skip_bad: bool
-) -> tuple[list[Path], list[Traversal], str, list[str]]:
-    """Run folders, their traversals, the CRS, and a line for each run that was left out."""
-    from rtmap_cli.errors import BadInput
-    from rtmap_cli.logs.traversal import find_runs, read_traversals
+def fuse_region(
+    traversals: Sequence[Traversal],
+    prior: VectorMap,
+    classes: Sequence[str],
+    fused: Collection[str],
+) -> tuple[Fusion, list[Element]]:
+    """Evidence and fusion of one region, and its candidates that wait for another run.
 
-    paths, bad = find_runs(runs_dir), []
-    if skip_bad:
-        good = []
-        for path in paths:
-            try:
-                crs = read_traversals([path], crs)[1]
-                good.append(path)
-            except BadInput as error:
-                bad.append(str(error))
-        if not good:
-            raise BadInput(runs_dir, "none of its runs can be used", bad[0])
-        paths = good
-    traversals, found = read_traversals(paths, crs)
-    return paths, traversals, found, bad
-
-
-def _fuse(
-    traversals: list[Traversal],
-    fresh: list[Traversal],
-    before: VectorMap | None,
-    crs: str,
-    paths: list[Path],
-    done: set[str],
-) -> Fusion:
-    from rtmap_cli.logs.traversal import classes_of
-    from rtmap_cli.maps.element import VectorMap
+    Here the rooms of change detection and of fusion meet; workers call it by its name.
+    """
     from rtmap_cli.steps.crowdsource.fuse import fuse
     from rtmap_cli.steps.detect_changes.evidence import gather_evidence
 
-    prior = before if before is not None else VectorMap((), crs)
-    evidence = gather_evidence(traversals, prior, classes_of(paths), fused=done)
-    return fuse(prior, evidence, fresh, traversals)
+    evidence = gather_evidence(traversals, prior, classes, fused=fused)
+    fusion = fuse(prior, evidence, [t for t in traversals if t.run_id not in fused], traversals)
+    waiting = set(fusion.waiting)
+    return fusion, [e.element for e in evidence if e.new and e.element.element_id in waiting]
 
 
-def _rebuildable(map_path: Path, known: set[str], traversals: list[Traversal]) -> bool:
+def _workers(jobs: int, engine: str, scheduler: str | None) -> Workers:
+    """Where the jobs run."""
+    from rtmap_cli.errors import UsageError
+    from rtmap_cli.steps.crowdsource.engines import in_process, in_processes, on_dask
+
+    if (engine == "dask") != (scheduler is not None):
+        raise UsageError("--engine dask and --scheduler tcp://HOST:PORT need each other")
+    if scheduler is not None:
+        if jobs > 1:
+            raise UsageError("--jobs is for this machine: a cluster has its own workers")
+        return partial(on_dask, scheduler=scheduler)
+    return in_process if jobs == 1 else partial(in_processes, jobs=jobs)
+
+
+def _rebuildable(map_path: Path, known: set[str], tracks: list[Track]) -> bool:
     """True when the map came from runs alone and all of them are at hand: fused together they
     give a better map than one after the other, and the same in any order."""
     from rtmap_cli.maps.store import history
 
     alone = all("crowdsource" in version.info for version in history(map_path))
-    return alone and known <= {t.run_id for t in traversals}
+    return alone and known <= {t.run_id for t in tracks}
 
 
-def _rebuilt(
-    traversals: list[Traversal],
-    before: VectorMap,
-    crs: str,
-    paths: list[Path],
-) -> Fusion:
-    """All runs fused at once; elements keep their ids."""
-    from rtmap_cli.steps.crowdsource.fuse import compared
-    from rtmap_cli.steps.crowdsource.identity import keep_ids
+def _committed(
+    map_path: Path, before: VectorMap | None, fusion: Fusion, text: str, names: list[str]
+) -> int:
+    """Write the next version of the map; returns its number."""
+    from rtmap_cli.maps.store import commit_map, write_new_map
 
-    fusion = _fuse(traversals, traversals, None, crs, paths, set())
-    return compared(before, keep_ids(before, fusion.vector_map), fusion.waiting)
+    info = {"crowdsource": fusion.counts()}
+    if before is None:
+        return write_new_map(fusion.vector_map, map_path, text, runs=names, info=info)
+    assert before.version is not None
+    return commit_map(map_path, fusion.vector_map, before.version, text, runs=names, info=info)
 
 
 def _tell_unlocalized(names: list[str], exists: bool) -> None:

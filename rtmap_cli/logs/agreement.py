@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,10 @@ class Agreement:
     detections: int
     found: int
 
+    def __add__(self, other: Agreement) -> Agreement:
+        """Of two parts of a run."""
+        return Agreement(*(getattr(self, n) + getattr(other, n) for n in self.__dataclass_fields__))
+
     def doubt(self, enough: float = ENOUGH_DETECTIONS) -> str:
         """What speaks against run and map being of one place, in words; empty where nothing.
 
@@ -48,8 +52,8 @@ class Agreement:
         return ""
 
 
-def agreement(traversal: Traversal, vector_map: VectorMap) -> Agreement:
-    """Compare the detections of a run, at its poses, with the elements of a map."""
+def agreement(traversal: Traversal, vector_map: VectorMap, sample: int = SAMPLE) -> Agreement:
+    """Compare (``sample`` of) the detections of a run, at its poses, with the elements of a map."""
     import shapely
 
     lines = np.array([shapely.LineString(e.xy) for e in vector_map], object)
@@ -57,7 +61,7 @@ def agreement(traversal: Traversal, vector_map: VectorMap) -> Agreement:
     in_range = np.zeros(len(traversal.pose), bool)
     in_range[shapely.STRtree(lines).query(_views(traversal), predicate="intersects")[0]] = True
     sure = np.flatnonzero((traversal.score >= SURE) & in_range[traversal.frame])
-    sure = sure[:: max(1, len(sure) // SAMPLE)]
+    sure = sure[:: max(1, len(sure) // sample)]
     found = 0
     for name in np.unique(traversal.class_name[sure].astype(str)):
         points = traversal.points[sure[traversal.class_name[sure] == name]]
@@ -92,10 +96,17 @@ def warning(
     """
     if not len(vector_map):
         return None
-    doubts = [(t.run_id, agreement(t, vector_map).doubt(enough)) for t in traversals]
+    return warning_of({t.run_id: agreement(t, vector_map) for t in traversals}, where, enough)
+
+
+def warning_of(
+    agreements: Mapping[str, Agreement], where: str | Path, enough: float = ENOUGH_DETECTIONS
+) -> str | None:
+    """The line of ``warning`` for the agreements of runs by their ids."""
+    doubts = [(name, a.doubt(enough)) for name, a in agreements.items()]
     doubts = [(name, doubt) for name, doubt in doubts if doubt]
     if not doubts:
         return None
     name, doubt = doubts[0]
-    more = f" ({len(doubts)} of {len(traversals)} runs are so)" if len(traversals) > 1 else ""
+    more = f" ({len(doubts)} of {len(agreements)} runs are so)" if len(agreements) > 1 else ""
     return f"warning: {name} and {where} hardly agree: {doubt}{more}; is it the map of this place?"

@@ -1,0 +1,101 @@
+"""The whole of it: cut a fleet into regions, fuse each, put them together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from rtmap_cli.errors import BadInput
+from rtmap_cli.logs.agreement import Agreement
+from rtmap_cli.logs.tracks import Track
+from rtmap_cli.maps.element import VectorMap
+from rtmap_cli.steps.crowdsource.fuse import Fusion, compared
+from rtmap_cli.steps.crowdsource.identity import keep_ids
+from rtmap_cli.steps.crowdsource.job import Compose, Job, Outcome, run_job
+from rtmap_cli.steps.crowdsource.stitch import stitch
+from rtmap_cli.steps.crowdsource.tiling import SIDE, plan
+
+Workers = Callable[[Callable[[Job], Outcome], Sequence[Job]], Iterable[Outcome]]
+"""Runs jobs and gives their outcomes in the order of the jobs (``engines``)."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be fused: the map ``before`` (None: there is none), the runs that are ``done``,
+    and whether all is fused ``anew``, as if the map were not there but for its ids."""
+
+    before: VectorMap | None
+    crs: str
+    done: frozenset[str] = frozenset()
+    anew: bool = False
+    without_sigma: bool = False
+    side: float = SIDE
+
+    @property
+    def prior(self) -> VectorMap:
+        """What the map holds before."""
+        return self.before if self.before is not None else VectorMap((), self.crs)
+
+
+@dataclass(frozen=True)
+class Result:
+    """The fusion of the ``tracks`` that could be used, with a line for each ``bad`` one, and how
+    the fresh runs agree with the map."""
+
+    fusion: Fusion
+    tracks: list[Track]
+    bad: list[str]
+    agreements: dict[str, Agreement]
+
+
+def crowdsource(
+    task: Task,
+    tracks: Sequence[Track],
+    compose: Compose,
+    workers: Workers,
+    skip_bad: bool = False,
+) -> Result:
+    """Fuse the tracks' runs; the same result for any order of them and any workers.
+
+    BadInput when a run turns out to be broken; with ``skip_bad`` it is left out and all begins
+    again without it.
+    """
+    tracks, bad = list(tracks), []
+    while True:
+        try:
+            outcomes = list(workers(partial(run_job, compose=compose), _jobs(task, tracks)))
+            break
+        except BadInput as error:
+            broken = [t for t in tracks if error.where.startswith(str(t.path))]
+            if not skip_bad or not broken:
+                raise
+            bad.append(str(error))
+            tracks = [t for t in tracks if t is not broken[0]]
+            if not tracks:
+                raise BadInput(
+                    broken[0].path.parent, "none of its runs can be used", bad[0]
+                ) from None
+    if task.anew:
+        made = stitch(VectorMap((), task.crs), outcomes)
+        fusion = compared(task.prior, keep_ids(task.prior, made.vector_map), made.waiting)
+    else:
+        fusion = stitch(task.prior, outcomes)
+    return Result(fusion, tracks, bad, _agreements(outcomes))
+
+
+def _jobs(task: Task, tracks: Sequence[Track]) -> list[Job]:
+    """The regions with everything that a worker needs."""
+    tracks = sorted(tracks, key=lambda t: t.run_id)
+    classes = tuple(dict.fromkeys(c for t in tracks for c in t.classes))
+    regions = plan(tracks, list(task.prior), task.side)
+    return [Job(r, task.crs, classes, task.done, task.anew, task.without_sigma) for r in regions]
+
+
+def _agreements(outcomes: Collection[Outcome]) -> dict[str, Agreement]:
+    """Per run, over its regions."""
+    out: dict[str, Agreement] = {}
+    for outcome in outcomes:
+        for name, found in outcome.agreements.items():
+            out[name] = found + out[name] if name in out else found
+    return dict(sorted(out.items()))

@@ -1,0 +1,153 @@
+"""One region fused on its own: what a worker does, here or on another machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.polylines import clip_to_box, length
+from rtmap_cli.logs.agreement import Agreement, agreement
+from rtmap_cli.logs.tracks import read_stretch
+from rtmap_cli.logs.traversal import Traversal, same_sigma
+from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
+from rtmap_cli.steps.crowdsource.fuse import Fusion
+from rtmap_cli.steps.crowdsource.tiling import Box, Region, band_of
+
+Array = NDArray[np.float64]
+
+Compose = Callable[
+    [Sequence[Traversal], VectorMap, Sequence[str], Collection[str]], tuple[Fusion, list[Element]]
+]
+"""Traversals, prior, classes and the runs that are fused already → Fusion, and the candidates that
+wait. The rooms of detect_changes and crowdsource meet in the command that gives it."""
+
+SAMPLE = 200
+"""Detections of a run that are compared with the prior in each region."""
+SHORTEST = 1.0
+"""Shorter pieces (m) that a cut would leave are dropped."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that a worker needs: small, and the same wherever it runs."""
+
+    region: Region
+    crs: str
+    classes: tuple[str, ...]
+    fused: frozenset[str]
+    anew: bool = False
+    without_sigma: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a region became: its ``old`` elements by the id of the one that they come from, ``new``
+    ones (``band`` of its square included), ids by what happened (``told``), ``waiting``, and how
+    each run agrees with the prior."""
+
+    box: Box | None
+    old: dict[str, list[Element]]
+    new: list[Element]
+    told: dict[str, list[str]]
+    waiting: list[Element]
+    agreements: dict[str, Agreement] = field(default_factory=dict)
+
+
+def run_job(job: Job, compose: Compose) -> Outcome:
+    """Read the frames of a region, gather what they say and fuse it."""
+    region = job.region
+    traversals = [read_stretch(path, frames) for path, frames in region.parts]
+    known = VectorMap(region.known, job.crs)
+    fresh = [t for t in traversals if t.run_id not in job.fused]
+    agree = {t.run_id: agreement(t, known, SAMPLE) for t in fresh} if len(known) else {}
+    if job.without_sigma:
+        traversals = [same_sigma(t) for t in traversals]
+    prior = VectorMap((), job.crs) if job.anew else known
+    fusion, waiting = compose(traversals, prior, job.classes, job.fused)
+    return _outcome(region, prior, fusion, waiting, agree)
+
+
+def _outcome(
+    region: Region,
+    prior: VectorMap,
+    fusion: Fusion,
+    waiting: list[Element],
+    agree: dict[str, Agreement],
+) -> Outcome:
+    """What of a fusion belongs to the region."""
+    ids, inserted = {e.element_id for e in prior}, set(fusion.inserted)
+    old: dict[str, list[Element]] = {
+        e.element_id: [] for e in prior if e.element_id in region.owned
+    }
+    new: list[Element] = []
+    for e in fusion.vector_map:
+        source = _source(e.element_id, ids, inserted)
+        if source is None:
+            new += _cut(e, band_of(region.box))
+        elif source in old:
+            old[source].append(e)
+    told = {
+        name: [k for k in getattr(fusion, name) if k in old]
+        for name in ("deleted", "split", "moved", "untouched")
+    }
+    here = [e for e in waiting if _within(e, region.box)]
+    return Outcome(region.box, old, new, told, here, agree)
+
+
+def _source(name: str, ids: Collection[str], inserted: Collection[str]) -> str | None:
+    """The prior element that an element of the fusion is, or is a part of; None for new ones."""
+    if name in ids:
+        return name
+    stem = name.rpartition(".")[0]
+    return stem if stem in ids and name not in inserted else None
+
+
+def _within(element: Element, box: Box | None) -> bool:
+    """True when the middle of the element lies in the box (half open, so that squares share
+    nothing)."""
+    if box is None:
+        return True
+    x, y = (element.xy.min(axis=0) + element.xy.max(axis=0)) / 2
+    return bool(box[0] <= x < box[2] and box[1] <= y < box[3])
+
+
+def _cut(element: Element, band: Box | None) -> list[Element]:
+    """A new element inside the band: rings whole or not at all, lines cut at its border."""
+    if band is None:
+        return [element]
+    low, high = element.xy.min(axis=0), element.xy.max(axis=0)
+    if (low >= band[:2]).all() and (high <= band[2:]).all():
+        return [element]
+    if element.class_name in RING_CLASSES:
+        return [element] if _within(element, band) else []
+    return parts_of(element, clip_to_box(with_covariance(element), band))
+
+
+def with_covariance(element: Element) -> Array:
+    """(n, 3 or 7) points and covariances side by side, to be cut and interpolated together."""
+    if element.covariance is None:
+        return element.points
+    return np.column_stack([element.points, element.covariance])
+
+
+def parts_of(element: Element, pieces: Sequence[Any]) -> list[Element]:
+    """Elements of pieces (n, 3 or 7) of one; the longest keeps the id."""
+    pieces = [p for p in pieces if len(p) > 1 and length(p) >= SHORTEST]
+    rank = np.argsort([-length(p) for p in pieces], kind="stable")
+    name = element.element_id
+    out = []
+    for k, p in enumerate(pieces):
+        place = int(np.flatnonzero(rank == k)[0])
+        out.append(
+            replace(
+                element,
+                element_id=f"{name}.{place}" if place else name,
+                points=p[:, :3],
+                covariance=p[:, 3:] if p.shape[1] > 3 else None,
+            )
+        )
+    return out
