@@ -94,13 +94,19 @@ def command(
     task = Task(before, crs, frozenset(done), anew, without_sigma, tile)
     fresh = [t for t in tracks if t.run_id not in done]
     _tell_unlocalized([t.run_id for t in fresh if not t.localized], exists)
-    fusion = None
+    _tell_mixed(fresh, before.version if before else None)
+    fusion, astray = None, {}
     if fresh:
         found = crowdsource(task, tracks, fuse_region, workers, skip_bad_runs)
         fusion, bad = found.fusion, bad + found.bad
         fresh = [t for t in found.tracks if t.run_id not in done]
         if doubt := warning_of(found.agreements, map_path):
             log(doubt)
+        astray = found.astray
+        for line in astray.values():
+            log(f"astray: {line}")
+        if not found.tracks:
+            raise NoAnswer(f"{runs_dir}: every run lies elsewhere than the map")
     for line in bad:
         log(f"left out: {line}")
     result: dict[str, Any] = {
@@ -110,6 +116,7 @@ def command(
         "runs": sorted(t.run_id for t in fresh),
         "known_runs": sorted(done),
         "bad_runs": bad,
+        "astray_runs": sorted(astray),
         "dry_run": dry_run,
     }
     if fusion is None:
@@ -137,7 +144,14 @@ def fuse_region(
     from rtmap_cli.steps.crowdsource.fuse import fuse
     from rtmap_cli.steps.detect_changes.evidence import gather_evidence
 
-    evidence = gather_evidence(traversals, prior, classes, fused=fused)
+    evidence = []
+    if all(set(classes) <= set(t.classes) for t in traversals):
+        evidence = gather_evidence(traversals, prior, classes, fused=fused)
+    else:
+        # A model that does not know a class has not looked for it.
+        for name in classes:
+            able = [t for t in traversals if name in t.classes]
+            evidence += gather_evidence(able, prior, [name], fused=fused) if able else []
     fusion = fuse(prior, evidence, [t for t in traversals if t.run_id not in fused], traversals)
     waiting = set(fusion.waiting)
     return fusion, [e.element for e in evidence if e.new and e.element.element_id in waiting]
@@ -186,6 +200,21 @@ def _tell_unlocalized(names: list[str], exists: bool) -> None:
         log(
             f"{len(names)} runs are not localized (first: {names[0]}): their initial poses are "
             "used; run `rtmap localize` first for a sharper map"
+        )
+
+
+def _tell_mixed(fresh: list[Track], version: int | None) -> None:
+    from rtmap_cli.output import log
+
+    models = {t.model for t in fresh if t.model}
+    if len(models) > 1:
+        log(f"the runs come from {len(models)} models: they vote alike, whatever each is worth")
+    ahead = [t for t in fresh if (t.map_version or 0) > (version or 0)]
+    if ahead and version is not None:
+        log(
+            f"{len(ahead)} runs (first: {ahead[0].run_id}) were made with version "
+            f"{ahead[0].map_version} of a map, this one has {version}: what they say about "
+            "elements that it does not have is left out"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,8 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Track:
     """The frames of a run that have a usable pose: numbers ``frame`` (m,) and places ``xy`` (m, 2)
-    in the map frame. ``reach`` (m): no detection is farther from its frame."""
+    in the map frame. ``reach`` (m): no detection is farther from its frame; ``digest`` of times and
+    initial poses tells copies of a run; ``model`` and ``map_version`` are what run.json states."""
 
     path: Path
     run_id: str
@@ -40,6 +42,9 @@ class Track:
     xy: Array
     reach: float
     localized: bool
+    digest: str = ""
+    model: str | None = None
+    map_version: int | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -77,7 +82,16 @@ def read_track(path: Path) -> Track:
         pose[usable, :2],
         reach,
         run.poses is not None,
+        _digest(run),
+        info.get("model_sha256"),
+        info["map_version"] if isinstance(info.get("map_version"), int) else None,
     )
+
+
+def _digest(run: Run) -> str:
+    """No two drives share all their times and initial poses."""
+    state = run.frames.timestamp_ns.tobytes() + run.frames.initial.tobytes()
+    return hashlib.sha256(state).hexdigest()
 
 
 def _check_head(path: Path) -> None:
@@ -115,16 +129,17 @@ def read_tracks(
             track = read_track(path)
             where = path / "run.json"
             check_same_crs(track.crs, crs or check_map_crs(track.crs, where), where)
-            if track.run_id in seen:
-                twin = f"is the run of {track.run_id}, as {seen[track.run_id]} is"
-                raise BadInput(path, twin, "drop one")
+            for name in (track.run_id, track.digest):
+                if name in seen:
+                    twin = f"is the run of {track.run_id}, as {seen[name]} is"
+                    raise BadInput(path, twin, "drop one")
         except BadInput as error:
             if not skip_bad:
                 raise
             bad.append(str(error))
             continue
         crs = crs or track.crs
-        seen[track.run_id] = path
+        seen |= {track.run_id: path, track.digest: path}
         out.append(track)
     if not out and bad:
         raise BadInput(Path(paths[0]).parent, "none of its runs can be used", bad[0])

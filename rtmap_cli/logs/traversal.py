@@ -37,7 +37,8 @@ class Traversal:
     ``score``, ``points`` (n, V, 2) in the map frame and ``covariance`` (n, V, 2, 2) = R Σ Rᵀ of
     the network's own scales (the pose's part is kept apart: it is common to a frame).
     ``asked``: prior elements that the network was asked about, see ``Questions``. ``cut`` (n,):
-    reaches the border of the range; ``localized``: the poses come from localization.
+    reaches the border of the range; ``localized``: the poses come from localization; ``classes``
+    that its model knows: of others its silence says nothing.
     """
 
     run_id: str
@@ -55,6 +56,7 @@ class Traversal:
     asked: Questions
     localized: bool = True
     model_sha256: str | None = None
+    classes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -181,6 +183,7 @@ def traversal_of(run: Run, min_score: float = FOUND_SCORE) -> Traversal:
         ),
         localized=run.poses is not None,
         model_sha256=run.info.get("model_sha256"),
+        classes=tuple(str(c) for c in run.info["classes"]),
     )
 
 

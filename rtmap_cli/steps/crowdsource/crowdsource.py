@@ -10,6 +10,7 @@ from rtmap_cli.errors import BadInput
 from rtmap_cli.logs.agreement import Agreement
 from rtmap_cli.logs.tracks import Track
 from rtmap_cli.maps.element import VectorMap
+from rtmap_cli.steps.crowdsource.astray import Astray
 from rtmap_cli.steps.crowdsource.fuse import Fusion, compared
 from rtmap_cli.steps.crowdsource.identity import keep_ids
 from rtmap_cli.steps.crowdsource.job import Compose, Job, Outcome, run_job
@@ -40,13 +41,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Result:
-    """The fusion of the ``tracks`` that could be used, with a line for each ``bad`` one, and how
-    the fresh runs agree with the map."""
+    """The fusion of the ``tracks`` that were used somewhere, with a line for each ``bad`` one, how
+    the fresh runs agree with the map, and those that lie ``astray`` with a line each."""
 
     fusion: Fusion
     tracks: list[Track]
     bad: list[str]
     agreements: dict[str, Agreement]
+    astray: dict[str, str]
 
 
 def crowdsource(
@@ -81,7 +83,32 @@ def crowdsource(
         fusion = compared(task.prior, keep_ids(task.prior, made.vector_map), made.waiting)
     else:
         fusion = stitch(task.prior, outcomes)
-    return Result(fusion, tracks, bad, _agreements(outcomes))
+    astray = _astray(outcomes)
+    used = frozenset[str]().union(*(o.used for o in outcomes))
+    return Result(
+        fusion,
+        [t for t in tracks if t.run_id in used],
+        bad,
+        {name: a for name, a in _agreements(outcomes).items() if name not in astray},
+        astray,
+    )
+
+
+def _astray(outcomes: Sequence[Outcome]) -> dict[str, str]:
+    """A line about each run that lies elsewhere, by its id."""
+    found: dict[str, list[Astray]] = {}
+    for a in (a for o in outcomes for a in o.astray):
+        found.setdefault(a.run_id, []).append(a)
+    out = {}
+    for name, parts in sorted(found.items()):
+        places = sum(name in o.used for o in outcomes) + sum(a.certain for a in parts)
+        text = f"{name}: what it saw lies {max(a.metres for a in parts):.0f} m off"
+        if any(a.certain for a in parts):
+            where = "" if len(parts) == places else f" in {len(parts)} of {places} tiles"
+            out[name] = f"{text}{where}; localize it again"
+        else:
+            out[name] = f"{text} another run and there is no third to tell who is right; both count"
+    return out
 
 
 def _jobs(task: Task, tracks: Sequence[Track]) -> list[Job]:

@@ -15,6 +15,8 @@ Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 Work = Callable[[Item], Answer]
 
+PATIENCE = 5
+"""Seconds to wait for a scheduler."""
 LIVES = 3
 """So often a pool that lost a worker is set up again before the jobs are given up."""
 
@@ -62,7 +64,7 @@ def on_dask(work: Work[Item, Answer], items: Sequence[Item], scheduler: str) -> 
     from distributed.scheduler import KilledWorker
 
     try:
-        client = Client(scheduler, timeout=20, set_as_default=False)
+        client = Client(scheduler, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise BadInput(scheduler, f"no scheduler answers ({first})", "start one") from None

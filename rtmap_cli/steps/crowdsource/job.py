@@ -14,6 +14,7 @@ from rtmap_cli.logs.agreement import Agreement, agreement
 from rtmap_cli.logs.tracks import read_stretch
 from rtmap_cli.logs.traversal import Traversal, same_sigma
 from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
+from rtmap_cli.steps.crowdsource.astray import Astray, find_astray
 from rtmap_cli.steps.crowdsource.fuse import Fusion
 from rtmap_cli.steps.crowdsource.tiling import Box, Region, band_of
 
@@ -46,8 +47,8 @@ class Job:
 @dataclass(frozen=True)
 class Outcome:
     """What a region became: its ``old`` elements by the id of the one that they come from, ``new``
-    ones (``band`` of its square included), ids by what happened (``told``), ``waiting``, and how
-    each run agrees with the prior."""
+    ones (the band around its square included), ids by what happened (``told``), ``waiting``, how
+    each run agrees with the prior, which are ``astray``, and the ids of those ``used``."""
 
     box: Box | None
     old: dict[str, list[Element]]
@@ -55,6 +56,8 @@ class Outcome:
     told: dict[str, list[str]]
     waiting: list[Element]
     agreements: dict[str, Agreement] = field(default_factory=dict)
+    astray: list[Astray] = field(default_factory=list)
+    used: frozenset[str] = frozenset()
 
 
 def run_job(job: Job, compose: Compose) -> Outcome:
@@ -64,11 +67,19 @@ def run_job(job: Job, compose: Compose) -> Outcome:
     known = VectorMap(region.known, job.crs)
     fresh = [t for t in traversals if t.run_id not in job.fused]
     agree = {t.run_id: agreement(t, known, SAMPLE) for t in fresh} if len(known) else {}
+    astray = find_astray(traversals, region.known, job.fused)
+    off = {a.run_id for a in astray if a.certain}
+    traversals = [t for t in traversals if t.run_id not in off]
     if job.without_sigma:
         traversals = [same_sigma(t) for t in traversals]
     prior = VectorMap((), job.crs) if job.anew else known
-    fusion, waiting = compose(traversals, prior, job.classes, job.fused)
-    return _outcome(region, prior, fusion, waiting, agree)
+    if traversals:
+        fusion, waiting = compose(traversals, prior, job.classes, job.fused)
+    else:
+        fusion, waiting = Fusion(prior, untouched=[e.element_id for e in prior]), []
+    used = frozenset(t.run_id for t in traversals)
+    out = _outcome(region, prior, fusion, waiting)
+    return replace(out, agreements=agree, astray=astray, used=used)
 
 
 def _outcome(
@@ -76,7 +87,6 @@ def _outcome(
     prior: VectorMap,
     fusion: Fusion,
     waiting: list[Element],
-    agree: dict[str, Agreement],
 ) -> Outcome:
     """What of a fusion belongs to the region."""
     ids, inserted = {e.element_id for e in prior}, set(fusion.inserted)
@@ -95,7 +105,7 @@ def _outcome(
         for name in ("deleted", "split", "moved", "untouched")
     }
     here = [e for e in waiting if _within(e, region.box)]
-    return Outcome(region.box, old, new, told, here, agree)
+    return Outcome(region.box, old, new, told, here)
 
 
 def _source(name: str, ids: Collection[str], inserted: Collection[str]) -> str | None:
