@@ -23,16 +23,19 @@ Call = Callable[..., Any]
 
 KILLS = 50
 
-# A child of this server is the command line of rtmap with everything imported already: a fork
-# costs milliseconds where a new interpreter costs a second.
+# A child of this server is the command line of rtmap with everything imported already (a dry run
+# sees to that): a fork costs milliseconds where a new interpreter costs a second.
 SERVER = """
 import os, signal, sys, time
 from rtmap_cli.cli import run
-import rtmap_cli.commands.crowdsource, rtmap_cli.steps.crowdsource.crowdsource
-import rtmap_cli.steps.detect_changes.evidence, rtmap_cli.maps.store, deltalake
-import pyarrow
+import deltalake, pyarrow
 pyarrow.set_cpu_count(1)
 pyarrow.set_io_thread_count(1)
+sys.stdout.flush()
+out = os.dup(1)
+os.dup2(2, 1)
+run(["crowdsource", sys.argv[1], "--map", sys.argv[1] + ".none", "--dry-run"])
+os.dup2(out, 1)
 for line in sys.stdin:
     seconds, *arguments = line.rstrip("\\n").split("\\t")
     begin, child = time.perf_counter(), os.fork()
@@ -51,9 +54,9 @@ for line in sys.stdin:
 class Server:
     """Runs command lines in forked processes, and kills them after a while."""
 
-    def __init__(self) -> None:
+    def __init__(self, runs: Path) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-c", SERVER],
+            [sys.executable, "-c", SERVER, str(runs)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -75,11 +78,13 @@ class Server:
 
 
 @pytest.fixture(scope="module")
-def server() -> Any:
+def server(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """One server for all kills."""
     if not hasattr(os, "fork"):
         pytest.skip("processes cannot be forked here")
-    made = Server()
+    warm = tmp_path_factory.mktemp("warm")
+    save(drive(street(), "d0", span=(0.0, 15.0)), warm / "runs/d0")
+    made = Server(warm / "runs")
     yield made
     made.close()
 
