@@ -47,31 +47,47 @@ class Marks:
 
 BELL = np.linspace(-2.4, 2.4, 17)
 """Where the bell across a line is laid down, in sigmas."""
+WIDEST = 1.2
+"""Larger sigmas (m) are taken as that: wider bells say nothing and cost most."""
+PAD = 34
+"""Cells around a field that bells of samples in it, or just beside it, may reach."""
+PART = 8192
+"""Samples that are laid down together: what they need stays in the processor's cache."""
 
 
-def deposits(marks: Marks, widest: float = 1.2) -> tuple[Array, Array, Array]:
-    """Places x, y (n, 17) in cells and masses (n, 17) of line samples, each N(0, sigma²) across
-    its line.
+def deposits(marks: Marks, start: Int, width: int, height: int) -> Array:
+    """Line samples, each N(0, sigma²) across its line, summed by cell: (rows y, columns x).
 
-    Samples farther apart than a cell are repeated along their tangents. ``sigma`` above
-    ``widest`` (m) is taken as that: wider bells say nothing and cost most.
+    Samples farther apart than a cell are repeated along their tangents.
     """
     spacing, tangent = marks.spacing, marks.tangent / CELL
     repeat = np.maximum(np.ceil(spacing / CELL), 1).astype(np.int64)
     row = np.repeat(np.arange(len(spacing)), repeat)
     k = np.arange(len(row)) - np.repeat(np.cumsum(repeat) - repeat, repeat)
     shift = ((k + 0.5) / repeat[row] - 0.5) * spacing[row]
-    s = np.clip(marks.sigma, CELL, widest)
-    x = marks.xy[row, 0] / CELL + shift * tangent[row, 0]
-    y = marks.xy[row, 1] / CELL + shift * tangent[row, 1]
-    across = s * tangent[:, 0], -s * tangent[:, 1]
+    x = marks.xy[row, 0] / CELL + shift * tangent[row, 0] - start[0]
+    y = marks.xy[row, 1] / CELL + shift * tangent[row, 1] - start[1]
+    side = PAD / 2
+    near = (x > -side) & (y > -side) & (x < width + side) & (y < height + side)
+    row, x, y = row[near], x[near] + PAD, y[near] + PAD
+    sigma = np.clip(marks.sigma, CELL, WIDEST)
+    # Single precision places a sample to a thousandth of a cell, in half the memory.
+    x, y = x.astype(np.float32), y.astype(np.float32)
+    ax = (-sigma * tangent[:, 1])[row].astype(np.float32)
+    ay = (sigma * tangent[:, 0])[row].astype(np.float32)
     bell = np.exp(-0.5 * BELL**2)
-    mass = (marks.score * spacing / repeat)[row, None] * (bell / bell.sum() / CELL**2)
-    return (
-        x[:, None] + across[1][row, None] * BELL,
-        y[:, None] + across[0][row, None] * BELL,
-        mass,
-    )
+    share = (marks.score * spacing / repeat)[row]
+    columns, rows = width + 2 * PAD, height + 2 * PAD
+    index, mass = np.empty((len(BELL), len(row)), np.int64), np.empty((len(BELL), len(row)))
+    for first in range(0, len(row), PART):
+        z = slice(first, first + PART)
+        for j, u in enumerate(BELL.astype(np.float32)):
+            # What is not negative is cut off as floor does.
+            cx, cy = (x[z] + u * ax[z]).astype(np.int32), (y[z] + u * ay[z]).astype(np.int32)
+            index[j, z] = cy * np.int32(columns) + cx
+            np.multiply(share[z], bell[j] / bell.sum() / CELL**2, out=mass[j, z])
+    out = np.bincount(index.ravel(), mass.ravel(), rows * columns).astype(np.float64, copy=False)
+    return out.reshape(rows, columns)[PAD : PAD + height, PAD : PAD + width]
 
 
 def _coarse_views(coarse: Int, traversal: Traversal) -> Array:
@@ -112,7 +128,9 @@ def _mean_field(
 ) -> Array:
     """Mean over the drives of deposits per view, (rows y, columns x)."""
     width, height = int(shape[0]), int(shape[1])
-    fields = [_sums(marks, start, width, height) if len(marks.score) else None for marks in drives]
+    fields = [
+        deposits(marks, start, width, height) if len(marks.score) else None for marks in drives
+    ]
     coarse_shape = (height // COARSE + 2, width // COARSE + 2)
     base = start // COARSE
     # The squares of the grid need not start with the field: what is left over is cut.
@@ -134,20 +152,6 @@ def _mean_field(
         if field is not None:
             total += field * _fine(trust / np.maximum(looked, 2.0), cut, height, width)
     return total / np.maximum(_fine(weight, cut, height, width), 0.5)
-
-
-def _sums(marks: Marks, start: Int, width: int, height: int) -> Array:
-    """The deposits of one drive summed by cell, (rows y, columns x)."""
-    x, y, mass = deposits(marks)
-    x -= start[0]
-    y -= start[1]
-    ok = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    if not ok.all():
-        x, y, mass = x[ok], y[ok], mass[ok]
-    # What is not negative is cut off as floor does.
-    index = y.astype(np.int64) * width + x.astype(np.int64)
-    out = np.bincount(index.ravel(), mass.ravel(), height * width).astype(np.float64)
-    return out.reshape(height, width)
 
 
 def _fine(coarse: Array, cut: Int, height: int, width: int) -> Array:
