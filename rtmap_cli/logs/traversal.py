@@ -105,6 +105,17 @@ def usable_poses(run: Run) -> tuple[NDArray[np.bool_], Array, Array]:
     usable = np.ones(len(frames), bool)
     if run.poses is None:
         return usable, pose, covariance
+    placed = run.poses.status != "no-match"
+    # A frame lost among localized ones would smear what they agree on.
+    order = np.flatnonzero(placed)[np.argsort(run.poses.frame[placed], kind="stable")]
+    known = run.poses.frame[order]
+    at = np.minimum(np.searchsorted(known, frames.frame), max(len(known) - 1, 0))
+    usable = known[at] == frames.frame if len(known) else np.zeros(len(frames), bool)
+    j = order[at[usable]] if len(known) else order
+    pose[usable] = xyyaw_of(run.poses.pose[j])
+    axes = np.array([0, 1, 5])
+    covariance[usable] = np.nan_to_num(run.poses.covariance[j][:, axes[:, None], axes])
+    return usable, pose, covariance
     row = {int(f): i for i, f in enumerate(run.poses.frame)}
     axes = np.array([0, 1, 5])
     for i, f in enumerate(frames.frame):

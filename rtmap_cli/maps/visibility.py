@@ -55,11 +55,17 @@ def hidden_in_frames(points: Array, frame: Int, boxes: Sequence[Array]) -> NDArr
     table = np.full((len(boxes), most, 5), np.nan)
     for row, own in zip(table, boxes, strict=True):
         row[: len(own)] = own
-    radius = np.hypot(table[..., 3], table[..., 4]) / 2 + 1e-6
-    nearest = np.maximum(np.hypot(table[..., 0], table[..., 1]) - radius, 0.0) ** 2
-    cx, cy = table[..., 0][frame], table[..., 1][frame]
     px, py = points[:, :1], points[:, 1:]
     square = px * px + py * py
+    radius = np.hypot(table[..., 3], table[..., 4]) / 2 + 1e-6
+    nearest = np.maximum(np.hypot(table[..., 0], table[..., 1]) - radius, 0.0) ** 2
+    # Boxes beyond all points hide none of them: often most of the traffic.
+    order = np.argsort(nearest, axis=1)
+    count = int((nearest <= square.max()).sum(axis=1).max(initial=0))
+    order = order[:, :count]
+    row = np.arange(len(boxes))[:, None]
+    table, radius, nearest = table[row, order], radius[row, order], nearest[row, order]
+    cx, cy = table[..., 0][frame], table[..., 1][frame]
     near = (px * cy - py * cx) ** 2 <= square * (radius**2)[frame]
     near &= (square >= nearest[frame]) & (px * cx + py * cy > -radius[frame] * np.sqrt(square))
     n, k = np.nonzero(near)
@@ -125,8 +131,10 @@ def views(
         [c * centre[0] - s * centre[1], s * centre[0] + c * centre[1]], axis=-1
     )
     tree = cKDTree(points)
+    room = reach + 1e-6
+    close = (middles >= points.min(axis=0) - room) & (middles <= points.max(axis=0) + room)
     frames, which, distances = [], [], []
-    for group in _groups(middles):
+    for group in _groups(middles, close.all(axis=1)):
         first = middles[group.start]
         room = reach + float(np.hypot(*(middles[group] - first).T).max())
         index = np.sort(np.asarray(tree.query_ball_point(first, room), np.int64))
@@ -153,13 +161,16 @@ TOGETHER, APART = 16, 12.0
 """At most so many frames, not farther apart (m), look for points together."""
 
 
-def _groups(middles: Array) -> list[slice]:
-    """Frames one after the other that stand near each other."""
+def _groups(middles: Array, wanted: NDArray[np.bool_]) -> list[slice]:
+    """Frames one after the other that stand near each other, without those not wanted."""
     out, start = [], 0
     while start < len(middles):
+        if not wanted[start]:
+            start += 1
+            continue
         part = middles[start : start + TOGETHER]
-        far = np.flatnonzero(np.hypot(*(part - part[0]).T) > APART)
-        stop = start + (int(far[0]) if len(far) else len(part))
+        end = (np.hypot(*(part - part[0]).T) > APART) | ~wanted[start : start + TOGETHER]
+        stop = start + (int(end.argmax()) if end.any() else len(part))
         out.append(slice(start, stop))
         start = stop
     return out
