@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 from fusion_scene import CRS, ORIGIN, crossing, drive, line, save, shifted, street
 
 from rtmap_cli.geometry.polylines import resample_step
@@ -330,3 +331,29 @@ def test_a_run_that_found_nothing_makes_no_map(rtmap: Call, tmp_path: Path) -> N
     save(empty, tmp_path / "runs" / "d0")
     rtmap("crowdsource", tmp_path / "runs", "--map", tmp_path / "map", code=4)
     assert not (tmp_path / "map").exists()
+
+
+def test_batch_and_one_by_one_agree_over_a_prior(rtmap: Call, tmp_path: Path) -> None:
+    """The tolerance that docs/crowdsource.md states, in any order."""
+    world = street(crossing("new", 50.0), without=["east"])
+    drives = {f"d{k}": drive(world, f"d{k}", seed=k) for k in range(4)}
+    maps = []
+    for name, batches in (
+        ("batch", [["d0", "d1", "d2", "d3"]]),
+        ("nights", [["d0"], ["d1"], ["d2"], ["d3"]]),
+        ("shuffled", [["d3"], ["d1", "d0"], ["d2"]]),
+    ):
+        write_new_map(shifted(street(), 0.1, 0.2), tmp_path / name, "prior")
+        for batch in batches:
+            for run in batch:
+                save(drives[run], tmp_path / f"{name}-runs" / run)
+            rtmap("crowdsource", tmp_path / f"{name}-runs", "--map", tmp_path / name)
+        maps.append(read_map(tmp_path / name).by_id())
+        assert fused_runs(tmp_path / name) == set(drives)
+    for other in maps[1:]:
+        assert set(other) == set(maps[0]) and "east" not in other
+        for name, e in maps[0].items():
+            line_, same = shapely.LineString(e.xy), shapely.LineString(other[name].xy)
+            tolerance = 0.25 if e.class_name == "ped_crossing" else 0.05
+            assert shapely.hausdorff_distance(line_, same, densify=0.1) < tolerance, name
+            assert e.traversals == other[name].traversals == 4
