@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -49,7 +50,8 @@ def _shaken(path: Path) -> None:
 @pytest.mark.parametrize("how", ["cut off", "shaken", "no frames", "no json"])
 def test_one_corrupt_run_among_a_hundred(rtmap: Call, tmp_path: Path, how: str) -> None:
     base = drive(street(), "d", span=(0.0, 25.0))
-    for k in range(100):
+    count = 100 if how == "shaken" else 50
+    for k in range(count):
         times = base.frames.timestamp_ns + k * 10**12
         run = replace(base, info=base.info | {"log_id": f"d{k:02d}"}, poses=None)
         save(replace(run, frames=replace(base.frames, timestamp_ns=times)), tmp_path / f"r/{k:02d}")
@@ -103,7 +105,8 @@ def test_a_traversal_that_is_20_m_off_a_map_is_left_out(
     told = rtmap("crowdsource", tmp_path / "all", "--map", tmp_path / "with", "--json")
     result = json.loads(told.out)
     assert result["astray_runs"] == ["stray"] and result["runs"] == ["d0", "d1"]
-    assert "stray" in told.err and "20 m off" in told.err
+    metres = re.search(r"stray: what it saw lies (\d+) m off", told.err)
+    assert metres is not None and abs(int(metres[1]) - 20) <= 2
     rtmap("crowdsource", tmp_path / "good", "--map", tmp_path / "without")
     good, same = read_map(tmp_path / "without").by_id(), read_map(tmp_path / "with").by_id()
     assert set(good) == set(same)

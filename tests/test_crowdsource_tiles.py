@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from rtmap_cli.logs.tracks import read_stretch, read_track
 from rtmap_cli.maps.crop import joined
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import read_map, write_new_map
+from rtmap_cli.steps.crowdsource.engines import in_processes
 from rtmap_cli.steps.crowdsource.stitch import stitch
 from rtmap_cli.steps.crowdsource.tiling import plan
 
@@ -123,6 +126,22 @@ def test_workers_change_no_byte(rtmap: Call, runs: Path, tmp_path: Path) -> None
         rtmap("crowdsource", runs, "--map", tmp_path / name, "--tile", 100, *more)
         digests.add(_content(tmp_path / name))
     assert len(digests) == 1
+
+
+def _die_once(marker: str) -> str:
+    """A job whose worker is killed the first time."""
+    path = Path(marker)
+    if not path.exists():
+        path.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return path.name
+
+
+def test_a_worker_that_dies_is_replaced(tmp_path: Path) -> None:
+    items = [str(tmp_path / f"m{k}") for k in range(4)]
+    for done in (items[0], items[1], items[3]):
+        Path(done).touch()
+    assert list(in_processes(_die_once, items, 2)) == ["m0", "m1", "m2", "m3"]
 
 
 def test_a_tile_that_holds_all_is_the_untiled_result(

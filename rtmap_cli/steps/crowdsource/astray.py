@@ -32,10 +32,10 @@ ENOUGH = 60
 """Fewer points of a class say nothing."""
 ALONG = 15.0
 """Without a map, only what lies so near (m) to the path of another run is compared."""
-LITTLE, MUCH, GAIN = 0.4, 0.6, 0.3
+LITTLE, MUCH, GAIN = 0.6, 0.6, 0.25
 """Share of a class that is at its place, below which a run is looked for elsewhere; share of all
 at the other place, and by how much it must be larger than here."""
-FARTHEST, NEAREST = 30, 5
+FARTHEST, NEAREST, STRIDE = 30, 5, 2
 """Shifts (cells) that are tried; smaller ones are errors as they come, for fusion to judge."""
 
 
@@ -161,7 +161,7 @@ def _shift(points: dict[str, Array], there: dict[str, Int]) -> float:
     here = {n: float(_hits(points[n], there[n], still)[0]) for n in classes}
     if not classes or min(here.values()) >= LITTLE:
         return 0.0
-    steps = np.arange(-FARTHEST, FARTHEST + 1)
+    steps = np.arange(-FARTHEST, FARTHEST + 1, STRIDE)
     shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     shifts = shifts[np.hypot(*shifts.T) >= NEAREST]
     weight = np.array([len(points[n]) for n in classes], np.float64)
