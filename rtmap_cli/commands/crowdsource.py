@@ -46,6 +46,13 @@ if TYPE_CHECKING:
     show_default=True,
     help="Where tiles are fused: here, or on a dask.distributed cluster (extra: dask).",
 )
+@click.option(
+    "--method",
+    type=click.Choice(["elements", "grid"]),
+    default="elements",
+    show_default=True,
+    help="How to fuse; grid (accumulation maps) is reserved and not there yet.",
+)
 @click.option("--scheduler", metavar="ADDRESS", help="Of the cluster: tcp://HOST:PORT.")
 @options.as_json
 def command(
@@ -59,6 +66,7 @@ def command(
     tile: float,
     jobs: int,
     engine: str,
+    method: str,
     scheduler: str | None,
     as_json: bool,
 ) -> None:
@@ -74,7 +82,7 @@ def command(
     Example:
       rtmap crowdsource runs --map map --message "week 12"
     """
-    from rtmap_cli.errors import NoAnswer
+    from rtmap_cli.errors import NoAnswer, UsageError
     from rtmap_cli.logs.agreement import warning_of
     from rtmap_cli.logs.tracks import read_tracks
     from rtmap_cli.logs.traversal import find_runs
@@ -82,6 +90,8 @@ def command(
     from rtmap_cli.output import emit, log
     from rtmap_cli.steps.crowdsource.crowdsource import Task, crowdsource
 
+    if method == "grid":
+        raise UsageError("--method grid is reserved: maps are fused from elements so far")
     workers = _workers(jobs, engine, scheduler)
     exists = map_exists(map_path)
     before = read_map(map_path) if exists else None
