@@ -89,7 +89,7 @@ def trace(points: RidgePoints, high: float, shortest: float) -> list[Array]:
     A line starts at ``high`` or more and goes on to the edge of the points; lines shorter than
     ``shortest`` (m) are dropped. A line that runs into another ends there.
     """
-    links = _links(points)
+    links, longest = _links(points)
     owner = [-1] * len(points)
     lines: list[Array] = []
     seeds = np.lexsort((points.cell[:, 1], points.cell[:, 0], -points.value))
@@ -99,9 +99,11 @@ def trace(points: RidgePoints, high: float, shortest: float) -> list[Array]:
         owner[seed] = name
         ahead = _walk(links, owner, seed, 0, name)
         behind = _walk(links, owner, seed, 1, name)
+        # Most are specks; what follows makes them a little shorter or longer, not much.
+        if (len(ahead) + len(behind)) * longest < 0.9 * shortest:
+            continue
         raw = points.xy[[*behind[::-1], seed, *ahead]]
-        # Most are specks; what follows makes lines a little shorter or longer, not twice as long.
-        if length(raw) < 0.5 * shortest:
+        if length(raw) < 0.9 * shortest:
             continue
         line = _smooth(raw)
         line = _straight_end(_straight_end(line)[::-1])[::-1]
@@ -123,12 +125,13 @@ class _Links:
     beside_first: list[int]
 
 
-def _links(points: RidgePoints) -> _Links:
-    """Neighbours within two cells, judged from every point in both directions at once."""
+def _links(points: RidgePoints) -> tuple[_Links, float]:
+    """Neighbours within two cells, judged from every point in both directions at once, and the
+    longest step (m) between two of them."""
     from scipy.spatial import cKDTree
 
     pairs = cKDTree(points.cell).query_pairs(2.0, p=np.inf, output_type="ndarray")
-    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+    i, j = np.ascontiguousarray(np.concatenate([pairs, pairs[:, ::-1]]).T)
     step, d = points.xy[j] - points.xy[i], points.direction[i]
     forward = step[:, 0] * d[:, 0] + step[:, 1] * d[:, 1]
     across = np.abs(step[:, 0] * d[:, 1] - step[:, 1] * d[:, 0])
@@ -147,13 +150,15 @@ def _links(points: RidgePoints) -> _Links:
         first.append(np.searchsorted(i[k], np.arange(n + 1)).tolist())
     k = np.flatnonzero((np.abs(forward) <= across) & (turn > 0.8))
     k = k[np.argsort(i[k], kind="stable")]
-    return _Links(
+    longest = float(np.hypot(step[:, 0], step[:, 1]).max(initial=0.0))
+    links = _Links(
         (onward[0], onward[1]),
         (turned[0], turned[1]),
         (first[0], first[1]),
         j[k].tolist(),
         np.searchsorted(i[k], np.arange(n + 1)).tolist(),
     )
+    return links, longest
 
 
 def _walk(links: _Links, owner: list[int], start: int, side: int, name: int) -> list[int]:
