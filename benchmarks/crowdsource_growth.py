@@ -147,9 +147,14 @@ def long_drive(base: Run, shift: Array, name: str) -> Run:
     return Run({**base.info, "log_id": name}, frames, Observations(**seen), boxes, poses)
 
 
+def copies_of(kilometres: float) -> int:
+    """Whole periods of about so many kilometres."""
+    return max(1, round(kilometres * 1000 / PERIOD))
+
+
 def write_fleet(folder: Path, kilometres: float, bases: list[Run]) -> int:
     """Runs over so many kilometres; returns the number of vertex observations."""
-    copies = max(1, round(kilometres * 1000 / PERIOD))
+    copies = copies_of(kilometres)
     per_row, per_drive = round(ROW * 1000 / PERIOD), round(DRIVE * 1000 / PERIOD)
     index = np.arange(copies)
     shift = np.stack([index % per_row * PERIOD, index // per_row * APART], axis=-1)
@@ -186,7 +191,7 @@ def measure(bases: list[Run], kilometres: float, options: argparse.Namespace) ->
             ["crowdsource", str(folder / "runs"), "--map", str(folder / "map"), *more]
         )
     return {
-        "kilometres": kilometres,
+        "kilometres": copies_of(kilometres) * PERIOD / 1000,
         "traversals": len(bases),
         "vertex observations": count,
         "cpu seconds": round(cpu, 1),

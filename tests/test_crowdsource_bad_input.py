@@ -136,7 +136,17 @@ def test_two_that_contradict_each_other_are_told_and_both_count(
     told = rtmap("crowdsource", tmp_path / "runs", "--map", tmp_path / "map", "--json")
     result = json.loads(told.out)
     assert result["astray_runs"] == result["runs"] == ["d0", "d1"]
-    assert "no third" in told.err
+    assert told.err.count("it counts") == 2
+
+
+def test_a_new_road_beside_an_old_one_is_no_error_of_two_runs(rtmap: Call, tmp_path: Path) -> None:
+    write_new_map(street(), tmp_path / "map", "prior")
+    for k in range(2):
+        save(_moved(drive(street(), f"d{k}", seed=k), 0.0, 22.0), tmp_path / f"runs/d{k}")
+    told = rtmap("crowdsource", tmp_path / "runs", "--map", tmp_path / "map", "--json")
+    result = json.loads(told.out)
+    assert result["astray_runs"] == result["runs"] == ["d0", "d1"]
+    assert result["counts"]["inserted"] > 0 and told.err.count("it counts") == 2
 
 
 def test_when_all_runs_are_astray_there_is_no_answer(rtmap: Call, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ metres. Changed streets and other towns fit nowhere better: they are not astray.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,17 +35,21 @@ ALONG = 15.0
 LITTLE, MUCH, GAIN = 0.6, 0.6, 0.25
 """Share of a class that is at its place, below which a run is looked for elsewhere; share of all
 at the other place, and by how much it must be larger than here."""
+ALIKE = 4.0
+"""Two runs whose shifts differ by no more (m) are off alike."""
 FARTHEST, NEAREST, STRIDE = 30, 5, 2
 """Shifts (cells) that are tried; smaller ones are errors as they come, for fusion to judge."""
 
 
 @dataclass(frozen=True)
 class Astray:
-    """A run that is ``metres`` off; ``certain``: left out, else nobody can tell who is right."""
+    """A run that is ``metres`` off the map or other runs; ``certain``: left out, else nobody
+    can tell who is right."""
 
     run_id: str
     metres: float
     certain: bool
+    off: str = "map"
 
 
 @dataclass(frozen=True)
@@ -62,14 +66,18 @@ def find_astray(
 ) -> list[Astray]:
     """The runs of a region that lie elsewhere; those in ``fused`` are not judged.
 
-    By the elements that are ``known`` there, or by each other. Two runs that contradict
-    each other without a third are both told, and neither is certain.
+    By the elements that are ``known`` there: certain, unless another run is off by as much (a new
+    road beside an old one). Without them by each other: certain when two others agree.
     """
     seen = [_seen(t) for t in sorted(traversals, key=lambda t: t.run_id)]
     if known:
         there = _marks_of(known)
-        found = [(s.run_id, _shift(s.points, there)) for s in seen if s.run_id not in fused]
-        return [Astray(name, metres, True) for name, metres in found if metres > 0]
+        found = {s.run_id: _shift(s.points, there) for s in seen if s.run_id not in fused}
+        moved = {name: shift for name, shift in found.items() if shift.any()}
+        return [
+            Astray(name, float(np.hypot(*shift)), not _alike(name, moved))
+            for name, shift in moved.items()
+        ]
     cells = [{name: _cells(p) for name, p in s.points.items()} for s in seen]
     marks = {name: _Marks(cells, name) for name in sorted({n for c in cells for n in c})}
     out = []
@@ -78,13 +86,17 @@ def find_astray(
         if s.run_id in fused or not others:
             continue
         near = _near(s.points, np.concatenate(others))
-        metres = _shift(near, {name: m.without(k) for name, m in marks.items()})
-        if metres > 0:
-            out.append(Astray(s.run_id, metres, True))
+        shift = _shift(near, {name: m.without(k) for name, m in marks.items()})
+        if shift.any():
+            out.append(Astray(s.run_id, float(np.hypot(*shift)), True, "other runs"))
     # Those who agree with each other are right, if there are two of them.
-    if len(seen) - len(out) < 2:
-        out = [Astray(a.run_id, a.metres, False) for a in out]
-    return out
+    return out if len(seen) - len(out) >= 2 else [replace(a, certain=False) for a in out]
+
+
+def _alike(name: str, moved: dict[str, Array]) -> bool:
+    """True when another run is off by as much in the same direction."""
+    others = [shift for other, shift in moved.items() if other != name]
+    return any(float(np.hypot(*(moved[name] - shift))) <= ALIKE for shift in others)
 
 
 def _seen(traversal: Traversal) -> _Seen:
@@ -154,13 +166,14 @@ def _hits(points: Array, there: Int, shifts: Int) -> Array:
     return out
 
 
-def _shift(points: dict[str, Array], there: dict[str, Int]) -> float:
-    """Metres by which the points lie elsewhere; 0 when they do not, or that cannot be told."""
+def _shift(points: dict[str, Array], there: dict[str, Int]) -> Array:
+    """(2,) metres by which the points must be moved to lie where they should; 0 when they do lie
+    there, or that cannot be told."""
     classes = [name for name, xy in points.items() if len(xy) >= ENOUGH and name in there]
     still = np.zeros((1, 2), np.int64)
     here = {n: float(_hits(points[n], there[n], still)[0]) for n in classes}
     if not classes or min(here.values()) >= LITTLE:
-        return 0.0
+        return np.zeros(2)
     steps = np.arange(-FARTHEST, FARTHEST + 1, STRIDE)
     shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     shifts = shifts[np.hypot(*shifts.T) >= NEAREST]
@@ -170,7 +183,7 @@ def _shift(points: dict[str, Array], there: dict[str, Int]) -> float:
     best = int(found.argmax())
     before = float(weight @ np.array([here[n] for n in classes]))
     if found[best] < max(MUCH, before + GAIN):
-        return 0.0
+        return np.zeros(2)
     # Shifts that fit as well lie around it, and along a straight street.
     alike = shifts[(found >= found[best] - 0.05) & (shifts @ shifts[best] > 0)]
-    return float(np.hypot(*alike.mean(axis=0))) * CELL
+    return np.asarray(alike.mean(axis=0) * CELL, np.float64)

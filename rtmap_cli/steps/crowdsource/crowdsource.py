@@ -102,12 +102,14 @@ def _astray(outcomes: Sequence[Outcome]) -> dict[str, str]:
     out = {}
     for name, parts in sorted(found.items()):
         places = sum(name in o.used for o in outcomes) + sum(a.certain for a in parts)
-        text = f"{name}: what it saw lies {max(a.metres for a in parts):.0f} m off"
+        text = (
+            f"{name}: what it saw lies {max(a.metres for a in parts):.0f} m off the {parts[0].off}"
+        )
         if any(a.certain for a in parts):
             where = "" if len(parts) == places else f" in {len(parts)} of {places} tiles"
-            out[name] = f"{text}{where}; localize it again"
+            out[name] = f"{text}{where}: left out there; localize it again"
         else:
-            out[name] = f"{text} another run and there is no third to tell who is right; both count"
+            out[name] = f"{text}, and another run disagrees no less or agrees with it: it counts"
     return out
 
 
