@@ -18,12 +18,16 @@ if TYPE_CHECKING:
 @options.map_path
 @options.map_version
 @options.output("GeoJSON file to write; - for stdout.")
+@click.option("--policy", "policy_path", type=options.PATH, help="TOML file: votes and thresholds.")
 @click.option(
     "--min-probability",
     type=options.FiniteRange(0, 1),
-    default=0.5,
-    show_default=True,
-    help="Leave out less probable changes.",
+    help="Leave out less probable changes.  [default: 0.5]",
+)
+@click.option(
+    "--max-false-alarms-per-km",
+    type=options.FiniteRange(0),
+    help="Tell the most probable changes, as many as this allows.",
 )
 @click.option("--displaced", is_flag=True, help="Also tell of lines that lie elsewhere (modify).")
 @click.option("--fail-on-change", is_flag=True, help="Exit 1 when a change is found.")
@@ -37,7 +41,9 @@ def command(
     map_path: Path,
     map_version: int | None,
     output: Path,
-    min_probability: float,
+    policy_path: Path | None,
+    min_probability: float | None,
+    max_false_alarms_per_km: float | None,
     displaced: bool,
     fail_on_change: bool,
     write_runs: bool,
@@ -59,9 +65,11 @@ def command(
     from rtmap_cli.formats.changes import write_change_table, write_changes
     from rtmap_cli.logs.agreement import warning
     from rtmap_cli.logs.traversal import classes_of, read_traversals
+    from rtmap_cli.maps.evidence import Policy, Settings
+    from rtmap_cli.maps.policy import read_policy
     from rtmap_cli.maps.store import read_map
     from rtmap_cli.output import emit, log
-    from rtmap_cli.steps.detect_changes.events import change_events
+    from rtmap_cli.steps.detect_changes.events import told_changes
     from rtmap_cli.steps.detect_changes.evidence import gather_evidence
     from rtmap_cli.tables import refuse_existing, refuse_inside
 
@@ -74,30 +82,34 @@ def command(
     tables = [path / "changes.parquet" for path in runs] if write_runs else []
     for table in tables:
         refuse_existing(table, overwrite, "pass --overwrite or leave out --write-runs")
+    policy = read_policy(policy_path) if policy_path else Policy()
+    policy = policy.telling(min_probability, max_false_alarms_per_km)
+    settings = Settings(policy=policy)
     prior = read_map(map_path, map_version)
     traversals, _ = read_traversals(runs, prior.crs)
     classes = classes_of(runs)
     _tell_unlocalized([t.run_id for t in traversals if not t.localized])
-    evidence = gather_evidence(traversals, prior, classes)
+    evidence = gather_evidence(traversals, prior, classes, settings)
     if len(prior) and not any(e.in_view for e in evidence if not e.new):
         raise NoAnswer(f"{map_path}: none of its elements is in view of any frame of these runs")
     if doubt := warning(traversals, prior, map_path):
         log(doubt)
-    found = change_events(evidence, min_probability, displaced)
+    kilometres = sum(t.kilometres for t in traversals)
+    found = told_changes(evidence, policy, kilometres, displaced)
     info = {
         "map": str(map_path),
         "map_version": prior.version,
         "crs_of_map": prior.crs,
         "runs": [t.run_id for t in traversals],
-        "min_probability": min_probability,
+        "min_probability": policy.least,
+        "max_false_alarms_per_km": policy.max_false_alarms_per_km,
     }
     write_changes(found, prior.crs, output, info)
     if write_runs:
         for table, traversal in zip(tables, traversals, strict=True):
-            own = gather_evidence([traversal], prior, classes)
-            alone = change_events(own, min_probability, displaced)
+            own = gather_evidence([traversal], prior, classes, settings)
+            alone = told_changes(own, policy, traversal.kilometres, displaced)
             write_change_table(alone, table, prior.crs)
-    kilometres = sum(t.kilometres for t in traversals)
     counts = {k: sum(c.kind == k for c in found) for k in ("delete", "insert", "modify")}
     told = ", ".join(f"{n} {kind}" for kind, n in counts.items())
     if not as_json:

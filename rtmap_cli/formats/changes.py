@@ -15,7 +15,7 @@ from rtmap_cli.errors import BadInput
 from rtmap_cli.formats.features import counter_clockwise, feature, write_features
 from rtmap_cli.logs.run import CHANGES
 from rtmap_cli.maps.element import RING_CLASSES
-from rtmap_cli.maps.evidence import Counts
+from rtmap_cli.maps.evidence import Counts, DriveEvidence
 from rtmap_cli.tables import read_table, table_metadata, write_table
 
 Array = NDArray[np.float64]
@@ -60,7 +60,21 @@ class ChangeEvent:
             "first_seen_ns": c.first_seen_ns,
             "last_seen_ns": c.last_seen_ns,
             "runs": list(c.runs),
+            "evidence": [_drive_properties(d) for d in c.drives],
         }
+
+
+def _drive_properties(drive: DriveEvidence) -> dict[str, Any]:
+    """What one drive says: frames, scores and its vote, ``log_odds`` that the element exists."""
+    return {
+        "run": drive.run_id,
+        "frames_seen": drive.frames_seen,
+        "frames_in_view": drive.frames_in_view,
+        "seen_ns": list(drive.seen_ns),
+        "score": None if drive.score is None else round(drive.score, 4),
+        "log_odds": round(drive.log_odds, 4),
+        "found": drive.seen,
+    }
 
 
 def write_changes(

@@ -17,7 +17,7 @@ So one silent drive says less than two, and a ghost loses against the drives tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,24 +40,20 @@ class VoteModel:
     same at places that were picked because something was found there; ``ghost``: share of the
     drives in which a false detection stays in place, seen at ``ghost_rate`` × found;
     ``strength``: how alike the frames of a drive are (beta-binomial pseudo-count, lower = more
-    alike); ``most_views``: frames beyond which a drive's vote does not grow.
+    alike), ``false_strength`` the same of false detections, which clump; ``most_views``: frames
+    beyond which a drive's vote does not grow.
     """
 
     found: float = 0.6
-    hard: float = 0.10
+    hard: float = 0.05
     hard_rate: float = 0.35
     false_rate: float = 0.02
     picked_rate: float = 0.06
     ghost: float = 0.05
     ghost_rate: float = 0.4
     strength: float = 8.0
-    most_views: float = 12.0
-
-    def with_found(self, found: float) -> VoteModel:
-        """The same model with another usual hit rate."""
-        from dataclasses import replace
-
-        return replace(self, found=float(np.clip(found, 0.25, 0.95)))
+    false_strength: float = 4.0
+    most_views: float = 24.0
 
 
 def _log_beta_binomial(hits: Array, misses: Array, rate: Array | float, strength: float) -> Array:
@@ -86,8 +82,8 @@ def drive_log_likelihoods(
     easy = _log_beta_binomial(h, m, model.found, s)
     hard = _log_beta_binomial(h, m, model.hard_rate * model.found, s)
     rate_if_absent = np.where(picked, model.picked_rate, model.false_rate)
-    false = _log_beta_binomial(h, m, rate_if_absent, s)
-    ghost = _log_beta_binomial(h, m, model.ghost_rate * model.found, s)
+    false = _log_beta_binomial(h, m, rate_if_absent, model.false_strength)
+    ghost = _log_beta_binomial(h, m, model.ghost_rate * model.found, model.false_strength)
     absent = np.logaddexp(np.log1p(-model.ghost) + false, np.log(model.ghost) + ghost)
     return np.stack([easy, hard, absent])
 
@@ -115,19 +111,55 @@ def logit(probability_: Array | float, limit: float = LIMIT) -> Array:
     return np.clip(np.log(p) - np.log1p(-p), -limit, limit)
 
 
-def usual_rate(hits: Array, views: Array, default: float, enough: float = 4.0) -> float:
-    """The usual hit rate of a class, measured on places with at least ``enough`` views.
+def fitted(hits: Array, views: Array, model: VoteModel, weight: Array | None = None) -> VoteModel:
+    """The model whose usual rate, likeness of frames and share of hard places fit best.
 
-    The upper-middle of the rates is taken, so that places where nothing is do not count; a few
-    places are mixed with ``default``.
+    ``hits``, ``views`` (drives, n) at places of the map, most of which exist; ``weight`` (n,) how
+    many independent places each of them is. Maximum of Σ weight · log p(counts of a place), each
+    place being easy, hard or absent, over a grid; ``model`` itself counts as ``PSEUDO`` places of
+    its own rates, so that little data changes little.
     """
-    ok = views >= enough
-    rate = hits[ok] / views[ok]
-    rate = rate[rate > 0.15]
-    if not len(rate):
-        return default
-    count = len(rate)
-    return float((np.quantile(rate, 0.6) * count + default * 20) / (count + 20))
+    w = np.ones(hits.shape[1]) if weight is None else weight
+    ok = (views >= 1).any(axis=0)
+    hits, views, w = hits[:, ok], views[:, ok], w[ok]
+    if not ok.any():
+        return model
+    trials = [(f, s) for f in FOUND_GRID for s in STRENGTH_GRID]
+    best, top = model, -np.inf
+    for found, strength in trials:
+        trial = replace(model, found=found, strength=strength)
+        votes = sum(drive_log_likelihoods(h, v, trial) for h, v in zip(hits, views, strict=True))
+        for hard in HARD_GRID:
+            shares = np.log([(1 - ABSENT) * (1 - hard), (1 - ABSENT) * hard, ABSENT])
+            total = float((w * _log_sum_exp(votes + shares[:, None])).sum())
+            total -= PSEUDO * _divergence(model, found, strength, hard)
+            if total > top:
+                best, top = replace(trial, hard=hard), total
+    return best
+
+
+FOUND_GRID = tuple(np.linspace(0.25, 0.95, 15))
+STRENGTH_GRID = (4.0, 8.0, 16.0)
+HARD_GRID = (0.02, 0.05, 0.1, 0.2)
+ABSENT = 0.08
+"""Share of the places of a map that exist no more, as ``PRIOR_LOG_ODDS`` says."""
+PSEUDO = 4.0
+
+
+def _log_sum_exp(values: Array) -> Array:
+    top = values.max(axis=0)
+    out: Array = top + np.log(np.exp(values - top).sum(axis=0))
+    return out
+
+
+def _divergence(model: VoteModel, found: float, strength: float, hard: float) -> float:
+    """What a trial is away from the model: squared differences of logit, log and log."""
+    rate = float(logit(found) - logit(model.found))
+    return (
+        rate**2
+        + float(np.log(strength / model.strength)) ** 2 / 4
+        + float(np.log(hard / model.hard)) ** 2 / 4
+    ) / 2
 
 
 def stretches(

@@ -63,6 +63,13 @@ class Stations:
 
         return cKDTree(self.xy)
 
+    @cached_property
+    def strand(self) -> Int:
+        """(n,) like ``chain``, but cut where a chain folds back to itself."""
+        from rtmap_cli.maps.strands import strands_of
+
+        return strands_of(self)
+
     def of_line(self, k: int) -> Int:
         """Indices of the stations of line ``k`` in order (they lie together)."""
         a, b = np.searchsorted(self.line, [k, k + 1])
@@ -222,9 +229,11 @@ def samples_of(points: Array, covariance: Array, score: Array, frame: Int) -> Sa
 
 
 def candidate_feet(
-    stations: Stations, samples: Samples, gate: float
+    stations: Stations, samples: Samples, gate: float, unit: Int | None = None
 ) -> tuple[Int, Int, Array, Array]:
-    """Best foot of each sample on each chain in reach: sample, station, offset, along."""
+    """Best foot of each sample on each chain, or ``unit`` (n,) of stations, in reach: sample,
+    station, offset, along."""
+    unit = stations.chain if unit is None else unit
     reach = float(np.hypot(gate, STEP))
     near = samples.tree.sparse_distance_matrix(stations.tree, reach, output_type="ndarray")
     i, j = near["i"].astype(np.int64), near["j"].astype(np.int64)
@@ -238,7 +247,7 @@ def candidate_feet(
         none = np.zeros(0, np.int64)
         return none, none, np.zeros(0), np.zeros(0)
     i, j, along, offset = i[ok], j[ok], along[ok], offset[ok]
-    key = i * (int(stations.chain.max()) + 1) + stations.chain[j]
+    key = i * (int(unit.max()) + 1) + unit[j]
     order = np.argsort(key)
     key = key[order]
     first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))

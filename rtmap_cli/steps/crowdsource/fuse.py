@@ -11,8 +11,15 @@ from numpy.typing import NDArray
 from rtmap_cli.geometry.polylines import arc_length, is_ring, length
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
-from rtmap_cli.maps.evidence import Counts, Evidence, Policy, Stretch
-from rtmap_cli.maps.existence import LIMIT, PRIOR_LOG_ODDS, probability
+from rtmap_cli.maps.evidence import (
+    Counts,
+    Evidence,
+    Policy,
+    Stretch,
+    newest_ns,
+    prior_log_odds,
+)
+from rtmap_cli.maps.existence import LIMIT, probability
 from rtmap_cli.maps.refit import FusionModel
 from rtmap_cli.steps.crowdsource.lines import fuse_lines, snap_ends
 from rtmap_cli.steps.crowdsource.rings import fuse_ring
@@ -65,7 +72,8 @@ def fuse(
     every = sorted(every, key=lambda t: t.run_id)
     out = Fusion(VectorMap((), prior.crs))
     charted = _Charted(prior)
-    pieces = [p for e in evidence for p in _pieces(e, policy, charted, out)]
+    now_ns = newest_ns(every)
+    pieces = [p for e in evidence for p in _pieces(e, policy, charted, now_ns, out)]
     judged = {e.element.element_id for e in evidence if not e.new}
     rest = [e for e in prior if e.element_id not in judged]
     elements = rest + _geometry(pieces, fresh, every, model, out)
@@ -111,11 +119,14 @@ class _Charted:
         return len(self.tree.query(line, predicate="dwithin", distance=UNCHARTED)) > 0
 
 
-def _pieces(evidence: Evidence, policy: Policy, charted: _Charted, out: Fusion) -> list[_Piece]:
+def _pieces(
+    evidence: Evidence, policy: Policy, charted: _Charted, now_ns: int, out: Fusion
+) -> list[_Piece]:
     """What remains of an element, or what a candidate becomes."""
     if evidence.new:
         return _inserted(evidence, policy, charted, out)
     element = evidence.element
+    before = prior_log_odds(element, policy, now_ns)
     if not evidence.in_view:
         out.untouched.append(element.element_id)
         return [_Piece(element, False, False)]
@@ -130,19 +141,23 @@ def _pieces(evidence: Evidence, policy: Policy, charted: _Charted, out: Fusion) 
         return []
     whole = len(kept) == 1 and not gone
     if whole:
-        return [_Piece(_updated(element, evidence.likelihood_ratio, evidence.counts), False, True)]
+        odds = before + evidence.likelihood_ratio
+        return [_Piece(_updated(element, odds, evidence.counts), False, True)]
     out.split.append(element.element_id)
-    return _split(element, kept)
+    return _split(element, kept, before)
 
 
 def _deletable(element: Element, stretch: Stretch, policy: Policy) -> bool:
-    """Improbable, and enough drives had a look at it (those of earlier fusions included)."""
+    """Improbable, enough drives had a look at it (those of earlier fusions included), and k of the
+    newest n missed it."""
     looked = element.traversals + stretch.counts.traversals_in_view
     unlikely = float(probability(stretch.log_odds)) < policy.delete_below
-    return unlikely and looked >= policy.delete_traversals
+    found, of = stretch.counts.newest(policy.delete_of)
+    missed = of - found >= min(policy.delete_traversals, of)
+    return unlikely and looked >= policy.delete_traversals and missed
 
 
-def _split(element: Element, kept: list[Stretch]) -> list[_Piece]:
+def _split(element: Element, kept: list[Stretch], before: float) -> list[_Piece]:
     """Elements for the stretches of one; the longest keeps the id."""
     order = sorted(range(len(kept)), key=lambda k: (-length(kept[k].geometry), k))
     taken = element.element_id
@@ -152,7 +167,8 @@ def _split(element: Element, kept: list[Stretch]) -> list[_Piece]:
         name = taken if rank == 0 else f"{taken}.{rank}"
         geometry, covariance = _part(element, stretch)
         piece = replace(element, element_id=name, points=geometry, covariance=covariance)
-        out[k] = _Piece(_updated(piece, stretch.likelihood_ratio, stretch.counts), False, True)
+        odds = before + stretch.likelihood_ratio
+        out[k] = _Piece(_updated(piece, odds, stretch.counts), False, True)
     return [out[k] for k in sorted(out)]
 
 
@@ -173,18 +189,15 @@ def _part(element: Element, stretch: Stretch) -> tuple[Array, Array | None]:
     return geometry, np.stack(rows, axis=-1)
 
 
-def _updated(element: Element, ratio: float, counts: Counts) -> Element:
-    """The element with the votes and counts of these runs added."""
-    before = element.existence
-    if element.traversals == 0 and element.existence == 0.0:
-        before = PRIOR_LOG_ODDS
+def _updated(element: Element, log_odds: float, counts: Counts) -> Element:
+    """The element with its log-odds after these runs, and their counts added."""
     if not counts.traversals_in_view:
         return element
     firsts = [t for t in (element.first_seen_ns, counts.first_seen_ns) if t is not None]
     lasts = [t for t in (element.last_seen_ns, counts.last_seen_ns) if t is not None]
     return replace(
         element,
-        existence=float(np.clip(before + ratio, -LIMIT, LIMIT)),
+        existence=float(np.clip(log_odds, -LIMIT, LIMIT)),
         seen=element.seen + counts.frames_seen,
         in_view=element.in_view + counts.frames_in_view,
         traversals=element.traversals + counts.traversals_in_view,
@@ -203,7 +216,8 @@ def _inserted(evidence: Evidence, policy: Policy, charted: _Charted, out: Fusion
     need = policy.insert_traversals
     if first:
         need = min(need, max(counts.traversals_in_view, 1))
-    if counts.traversals_seen < need:
+    found, _ = counts.newest(policy.insert_of)
+    if found < need:
         out.waiting.append(element.element_id)
         return []
     out.inserted.append(element.element_id)

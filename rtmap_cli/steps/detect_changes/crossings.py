@@ -18,7 +18,6 @@ from rtmap_cli.steps.detect_changes.votes import (
     answer_value,
     count,
     detection_value,
-    view_weight,
 )
 
 Array = NDArray[np.float64]
@@ -30,6 +29,8 @@ VISIBLE = 0.65
 """A ring is in view of a frame when this share of its outline and middle is."""
 INSIDE = 0.6
 """A detection with this share of its area in a known ring is a piece of that ring."""
+FAR_LOSS = 0.25
+"""Share of the detection probability that is lost at 36 m."""
 RING_MARGIN = 0.5
 """Border of the range (m) in which the outline does not count as looked at."""
 
@@ -222,7 +223,8 @@ def _ring_views(places: Array, traversal: Traversal) -> tuple[Views, Array]:
     distance = np.bincount(inverse, seen.distance) / np.bincount(inverse) if len(keys) else share
     ok = share >= VISIBLE
     whole = Views(keys[ok] // n, keys[ok] % n, distance[ok])
-    return whole, share[ok] * view_weight(distance[ok])
+    near = 1.0 - FAR_LOSS * np.minimum(distance[ok] / 36.0, 1.0) ** 2
+    return whole, np.minimum(share[ok] + 0.2, 1.0) * near
 
 
 def ring_counts(
@@ -244,8 +246,7 @@ def ring_counts(
         key = np.concatenate(
             [rings.frame[hit] * n + owner[hit], (asked.frame * n + known)[known >= 0]]
         )
-        value = np.concatenate(
-            [detection_value(rings.score[hit]), answer_value(asked.existence[known >= 0])]
-        )
-        counts.append(count(n, traversal, seen, weight, key, value))
+        score = [rings.score[hit], asked.existence[known >= 0]]
+        value = np.concatenate([detection_value(score[0]), answer_value(score[1])])
+        counts.append(count(n, seen, weight, key, value, np.concatenate(score)))
     return counts

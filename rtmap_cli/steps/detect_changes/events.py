@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.formats.changes import ChangeEvent
 from rtmap_cli.geometry.polylines import length
-from rtmap_cli.maps.evidence import Evidence, Stretch
+from rtmap_cli.maps.evidence import Evidence, Policy, Stretch
 from rtmap_cli.maps.existence import logit, probability, runs_of
 
 Array = NDArray[np.float64]
@@ -43,6 +43,35 @@ def change_events(
             out += _modified(e)
     out = [c for c in out if c.probability >= min_probability]
     return sorted(out, key=lambda c: (-c.probability, c.change_id))
+
+
+def told_changes(
+    evidence: Sequence[Evidence], policy: Policy, kilometres: float, displaced: bool = False
+) -> list[ChangeEvent]:
+    """The changes that a policy tells of drives of so many ``kilometres``, most probable first."""
+    found = change_events(evidence, policy.least, displaced)
+    if policy.max_false_alarms_per_km is None:
+        return found
+    return within_budget(found, kilometres, policy.max_false_alarms_per_km)
+
+
+def within_budget(
+    events: Sequence[ChangeEvent], kilometres: float, max_per_km: float
+) -> list[ChangeEvent]:
+    """The most probable changes, as many as may be told with ``max_per_km`` false alarms expected.
+
+    Of calibrated probabilities the expected number of false alarms is Σ (1 − p); a delete and an
+    insert of one probability are told or left out together.
+    """
+    order = sorted(events, key=lambda c: (-c.probability, c.change_id))
+    told = np.array([c.probability for c in order])
+    expected = np.cumsum(1.0 - told)
+    ok = expected <= max_per_km * kilometres + 1e-12
+    count = int(ok.sum())
+    # Equal probabilities are one step.
+    while 0 < count < len(told) and told[count] == told[count - 1]:
+        count -= 1
+    return order[:count]
 
 
 def _event(

@@ -11,14 +11,23 @@ from numpy.typing import NDArray
 from rtmap_cli.geometry.polylines import is_ring, length
 from rtmap_cli.geometry.rings import RING_POINTS, close, open_ring
 from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.assignment import assign_once, offset_sigma
 from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
-from rtmap_cli.maps.evidence import Counts, Evidence, Policy, Settings, Stretch
+from rtmap_cli.maps.evidence import (
+    Counts,
+    Evidence,
+    Policy,
+    Settings,
+    Stretch,
+    newest_ns,
+    prior_log_odds,
+)
 from rtmap_cli.maps.existence import (
     LIMIT,
-    PRIOR_LOG_ODDS,
     runs_of,
     stretches,
 )
+from rtmap_cli.maps.sight import SightModel
 from rtmap_cli.maps.stations import GATE, MIN_COS, Samples, Stations, stations_of
 from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, ring_counts
 from rtmap_cli.steps.detect_changes.lines import (
@@ -29,9 +38,13 @@ from rtmap_cli.steps.detect_changes.lines import (
     new_lines,
     refit_lines,
 )
-from rtmap_cli.steps.detect_changes.votes import Ballot, ballot
+from rtmap_cli.steps.detect_changes.rivals import neighbours, questioned, weighed
+from rtmap_cli.steps.detect_changes.votes import Ballot, ballot, sight_of
 
 Array = NDArray[np.float64]
+
+APART = 8
+"""Every so many stations (m) a line says something of its own about how often lines are found."""
 
 
 def gather_evidence(
@@ -57,12 +70,6 @@ def gather_evidence(
     return out
 
 
-def prior_log_odds(element: Element) -> float:
-    """Log-odds before the runs: the element's own where it has a history, else the usual one."""
-    history = element.traversals > 0 or element.existence != 0.0
-    return float(element.existence) if history else PRIOR_LOG_ODDS
-
-
 def new_id(class_name: str, geometry: Array) -> str:
     """An id from class and place (to half a metre): the same find gets the same id again."""
     place = np.round(np.asarray(geometry)[:, :2].mean(axis=0) * 2) / 2
@@ -81,10 +88,14 @@ def _lines(
     prior: list[Element],
     settings: Settings,
 ) -> list[Evidence]:
-    runs, policy = [t.run_id for t in traversals], settings.policy
+    policy, now_ns = settings.policy, newest_ns(traversals)
     samples = [class_samples(t, name) for t in traversals]
     old = [e.xy for e in prior]
-    found = new_lines(name, stations_of(old), traversals, samples)
+    known = stations_of(old)
+    sigma = [offset_sigma(known, s) for s in samples]
+    feet = [assign_once(known, s)[0] for s in samples]
+    sight = sight_of(known, traversals, samples, feet, policy.view_margin_m)
+    found = new_lines(name, known, traversals, samples)
     for _ in range(2):
         found = refit_lines(found, old, traversals, samples, settings.fusion)
     for last in (False, True):
@@ -92,20 +103,60 @@ def _lines(
         if not len(stations):
             return []
         ids = [e.element_id for e in prior] + [""] * len(found)
-        counts = all_line_counts(stations, ids, traversals, samples, policy.view_margin_m)
-        before = int(np.searchsorted(stations.line, len(old)))
-        votes = ballot(counts, runs, settings.votes, fresh, before)
+        votes = _line_votes(
+            stations, ids, len(old), traversals, samples, sigma, sight, fresh, settings
+        )
         if last:
             break
         # What is left of the candidates competes once more, without those that were refuted.
         found = _supported(found, len(old), stations, votes, policy)
         found = joined_lines(found, name)
-    out = [_line_evidence(e, k, stations, votes, settings) for k, e in enumerate(prior)]
+    out = [_line_evidence(e, k, stations, votes, settings, now_ns) for k, e in enumerate(prior)]
     _add_offsets(out, stations, traversals, samples, fresh, settings)
     for k, line in enumerate(found):
         element = Element(new_id(name, line), name, line)
-        out.append(_line_evidence(element, len(old) + k, stations, votes, settings, new=True))
+        out.append(
+            _line_evidence(element, len(old) + k, stations, votes, settings, now_ns, new=True)
+        )
     return out
+
+
+def _line_votes(
+    stations: Stations,
+    ids: Sequence[str],
+    old: int,
+    traversals: Sequence[Traversal],
+    samples: Sequence[Samples],
+    sigma: Sequence[Array],
+    sight: SightModel,
+    fresh: NDArray[np.bool_],
+    settings: Settings,
+) -> Ballot:
+    """The votes on all stations, the first ``old`` lines being those of the prior; ``sigma`` of
+    every drive's samples as ``offset_sigma`` has it."""
+    before = int(np.searchsorted(stations.line, old))
+    margin = settings.policy.view_margin_m
+    drives = stations, ids, traversals, samples, margin, sight
+    full = all_line_counts(*drives)
+    votes = ballot(full.counts, traversals, settings.votes, fresh, before, APART)
+    picked = np.arange(len(stations)) >= before
+    pairs = neighbours(stations)
+    doubtful = questioned(votes, pairs, before)
+    some = np.flatnonzero(fresh)
+    for asked, rows in ((picked, np.arange(len(fresh))), (doubtful, some)):
+        if asked.any() and len(rows):
+            without = all_line_counts(*drives, first=~(asked | picked))
+            votes = weighed(
+                votes,
+                full.select(rows),
+                without.select(rows),
+                [sigma[int(k)] for k in rows],
+                asked,
+                pairs,
+                stations,
+                picked,
+            )
+    return votes
 
 
 def _add_offsets(
@@ -180,12 +231,13 @@ def _line_evidence(
     stations: Stations,
     votes: Ballot,
     settings: Settings,
+    now_ns: int,
     new: bool = False,
 ) -> Evidence:
     policy = settings.policy
     index = stations.of_line(k)
     ring = is_ring(element.points)
-    before = policy.new_log_odds if new else prior_log_odds(element)
+    before = policy.new_log_odds if new else prior_log_odds(element, policy, now_ns)
     evidence = votes.evidence[index]
     looked = votes.views[index] > 0
     real = np.ones(len(index), bool)
@@ -263,11 +315,11 @@ def _cut_out(points: Array, stations: Stations, places: NDArray[np.int64]) -> Ar
 def _without_slivers(
     real: NDArray[np.bool_], spacing: Array, shortest: float, ring: bool
 ) -> NDArray[np.bool_]:
-    """Absent runs too short to be told of count as existing: nothing is cut out there."""
+    """Absent runs too short to be told of, and elements as short, count as existing: nobody
+    reports pieces of that length."""
     out = real.copy()
-    if real.any():
-        for run in runs_of(~real, ring):
-            out[run] = spacing[run].sum() < shortest
+    for run in runs_of(~real, ring and bool(real.any())):
+        out[run] = spacing[run].sum() < shortest
     return out
 
 
@@ -290,17 +342,18 @@ def _rings(
     elements = list(prior) + [Element(new_id(name, r), name, close(r)) for r in found]
     ids = [e.element_id for e in elements]
     counts = ring_counts(places, ids, traversals, drives)
-    runs = [t.run_id for t in traversals]
-    votes = ballot(counts, runs, settings.votes, fresh, len(prior))
+    votes = ballot(counts, traversals, settings.votes, fresh, len(prior))
     return [
-        _ring_evidence(e, k, votes, settings, new=k >= len(prior)) for k, e in enumerate(elements)
+        _ring_evidence(e, k, votes, settings, newest_ns(traversals), new=k >= len(prior))
+        for k, e in enumerate(elements)
     ]
 
 
 def _ring_evidence(
-    element: Element, k: int, votes: Ballot, settings: Settings, new: bool
+    element: Element, k: int, votes: Ballot, settings: Settings, now_ns: int, new: bool
 ) -> Evidence:
-    before = settings.policy.new_log_odds if new else prior_log_odds(element)
+    policy = settings.policy
+    before = policy.new_log_odds if new else prior_log_odds(element, policy, now_ns)
     ratio = float(votes.evidence[k]) if votes.views[k] > 0 else 0.0
     odds = float(np.clip(before + ratio, -LIMIT, LIMIT))
     index = np.array([k])

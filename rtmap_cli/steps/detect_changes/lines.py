@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.logs.traversal import Traversal, pose_variance
+from rtmap_cli.maps.assignment import across_sigma, assign_once
 from rtmap_cli.maps.refit import (
     FusionModel,
     combine,
@@ -15,6 +16,7 @@ from rtmap_cli.maps.refit import (
     measured_share,
     solve_vertices,
 )
+from rtmap_cli.maps.sight import SightModel
 from rtmap_cli.maps.stations import (
     Samples,
     Stations,
@@ -31,7 +33,8 @@ from rtmap_cli.steps.detect_changes.ridges import (
     ridge_points,
     trace,
 )
-from rtmap_cli.steps.detect_changes.votes import DriveCounts, line_counts
+from rtmap_cli.steps.detect_changes.rivals import Play
+from rtmap_cli.steps.detect_changes.votes import line_counts
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -61,12 +64,6 @@ def class_samples(traversal: Traversal, class_name: str) -> Samples:
     )
 
 
-def _across(samples: Samples) -> Array:
-    """(n,) standard deviation across the detection itself, metres."""
-    normal = np.stack([-samples.tangent[:, 1], samples.tangent[:, 0]], axis=-1)
-    return np.sqrt(np.einsum("ni,nij,nj->n", normal, samples.covariance, normal))
-
-
 def new_lines(
     class_name: str,
     prior: Stations,
@@ -76,9 +73,9 @@ def new_lines(
     """Polylines (n, 2) where detections that no prior line explains agree; not yet judged."""
     drives = []
     for s in samples:
-        _, taken = assign(prior, s)
+        _, taken = assign_once(prior, s)
         k = loose_stretches(s, taken, SHORTEST)
-        drives.append(Marks(s.xy[k], s.tangent[k], s.spacing[k], _across(s)[k], s.score[k]))
+        drives.append(Marks(s.xy[k], s.tangent[k], s.spacing[k], across_sigma(s)[k], s.score[k]))
     widths = np.concatenate([d.sigma for d in drives])
     if not len(widths):
         return []
@@ -158,10 +155,15 @@ def all_line_counts(
     traversals: Sequence[Traversal],
     samples: Sequence[Samples],
     margin: float,
-) -> list[DriveCounts]:
-    """Counts of every drive at all stations; every detection goes to one line only."""
-    counts = []
+    sight: SightModel,
+    first: NDArray[np.bool_] | None = None,
+) -> Play:
+    """Counts of every drive at all stations; every detection goes to one line only.
+
+    With ``first`` (stations,) these choose their detections before the others.
+    """
+    counts, feet = [], []
     for traversal, s in zip(traversals, samples, strict=True):
-        feet = assign(stations, s)[0]
-        counts.append(line_counts(stations, ids, traversal, s, feet, margin))
-    return counts
+        feet.append(assign_once(stations, s, first)[0])
+        counts.append(line_counts(stations, ids, traversal, s, feet[-1], margin, sight))
+    return Play(counts, feet)

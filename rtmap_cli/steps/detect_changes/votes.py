@@ -9,42 +9,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.logs.traversal import Traversal
-from rtmap_cli.maps.evidence import Counts
-from rtmap_cli.maps.existence import VoteModel, drive_log_likelihoods, log_odds_of, usual_rate
+from rtmap_cli.maps.evidence import Counts, DriveEvidence
+from rtmap_cli.maps.existence import VoteModel, drive_log_likelihoods, fitted, log_odds_of
+from rtmap_cli.maps.sight import Look, SightModel, measured_sight
 from rtmap_cli.maps.stations import STEP, Feet, Samples, Stations
 from rtmap_cli.maps.visibility import Views, views
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
-END_FADE = 3.0
-"""Detections are cut short: so near (m) to the end of a line a miss counts less."""
 SEEN_SHARE = 0.3
 """A drive has seen a place when it found something in this share of the usual rate."""
+CONFIRMED = 0.35
+"""A line found by this share of the frames that looked is there."""
 NOISE_SCORE = 0.1
 """A detection of this score or less says nothing …"""
 SURE_NO, SURE_YES = 0.15, 0.85
 """… nor does an existence up to the first; from the second on the network is sure."""
-FAR_LOSS = 0.5
-"""Share of the detection probability that is lost at 36 m."""
 
 
 @dataclass(frozen=True)
 class DriveCounts:
-    """One drive at n places: fractional ``hits`` of weighted ``views``, frames that hit and that
-    looked, and times of the first and last hit (ns; 0 where none)."""
+    """One drive at n places: fractional ``hits`` of weighted ``views``. Of every view its
+    ``view_place`` and ``view_frame``, of every hit ``hit_place``, ``hit_frame``, ``hit_score``."""
 
     hits: Array
     views: Array
-    frames_seen: Int
-    frames_in_view: Int
-    first_ns: Int
-    last_ns: Int
-
-
-def view_weight(distance: Array) -> Array:
-    """Detection probability by distance, relative to a near place: negative evidence weighs so."""
-    return 1.0 - FAR_LOSS * np.minimum(distance / 36.0, 1.0) ** 2
+    view_place: Int
+    view_frame: Int
+    hit_place: Int
+    hit_frame: Int
+    hit_score: Array
 
 
 def detection_value(score: Array) -> Array:
@@ -57,37 +53,70 @@ def answer_value(existence: Array) -> Array:
     return np.clip((existence - SURE_NO) / (SURE_YES - SURE_NO), 0.0, 1.0)
 
 
-def count(
-    n: int, traversal: Traversal, seen: Views, weight: Array, key: Int, value: Array
-) -> DriveCounts:
-    """Counts of ``n`` places from views with ``weight`` and hits ``key`` = frame · n + place.
+def count(n: int, seen: Views, weight: Array, key: Int, value: Array, score: Array) -> DriveCounts:
+    """Counts of ``n`` places from views and hits ``key`` = frame · n + place.
+
+    ``weight``: the detection probability of each view, relative to a good one: so many hits are
+    expected of a place that exists, times its usual rate.
 
     ``key`` may repeat: the best ``value`` of a frame counts. Hits outside every view (beyond the
     margin, or seen past an occluder) do not count: neither would a miss have.
     """
     view_key = seen.frame * n + seen.point
     order = np.lexsort((-value, key))
-    key, value = key[order], value[order]
+    key, value, score = key[order], value[order], score[order]
     first = np.ones(len(key), bool)
     first[1:] = key[1:] != key[:-1]
-    key, value = key[first], value[first]
+    key, value, score = key[first], value[first], score[first]
     at = np.searchsorted(view_key, key)
     at = np.minimum(at, max(len(view_key) - 1, 0))
     ok = view_key[at] == key if len(view_key) else np.zeros(len(key), bool)
-    at, value = at[ok], value[ok]
-    place, time = seen.point[at], traversal.timestamp_ns[seen.frame[at]]
-    start = np.full(n, np.iinfo(np.int64).max)
-    last = np.zeros(n, np.int64)
-    np.minimum.at(start, place, time)
-    np.maximum.at(last, place, time)
+    at, value, score = at[ok], value[ok], score[ok]
+    place = seen.point[at]
     return DriveCounts(
-        np.bincount(place, value * weight[at], n).astype(np.float64),
+        np.bincount(place, value, n).astype(np.float64),
         np.bincount(seen.point, weight, n).astype(np.float64),
-        np.bincount(place, minlength=n),
-        np.bincount(seen.point, minlength=n),
-        np.where(last > 0, start, 0),
-        last,
+        seen.point,
+        seen.frame,
+        place,
+        seen.frame[at],
+        score,
     )
+
+
+def looks(stations: Stations, traversal: Traversal, margin: float) -> tuple[Views, Look]:
+    """Views of the stations by one drive, and how good each of them is."""
+    seen = views(stations.xy, traversal.pose, traversal.range_m, traversal.occluders, margin=margin)
+    pose = traversal.pose[seen.frame]
+    d = stations.xy[seen.point] - pose[:, :2]
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    local = np.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]], axis=-1)
+    low, high = np.reshape(traversal.range_m, (2, 2))
+    border = np.minimum(local - low, high - local).min(axis=1, initial=np.inf)
+    return seen, Look(seen.distance, stations.to_end[seen.point], border)
+
+
+def sight_of(
+    stations: Stations,
+    traversals: Sequence[Traversal],
+    samples: Sequence[Samples],
+    feet: Sequence[Feet],
+    margin: float,
+) -> SightModel:
+    """How well the drives see lines, measured on those of the map that they confirm."""
+    n, parts, found = len(stations), [], []
+    for traversal, s, own in zip(traversals, samples, feet, strict=True):
+        seen, look = looks(stations, traversal, margin)
+        near = [np.clip(own.station + k, 0, n - 1) for k in (-1, 0, 1)]
+        hit = np.isin(
+            seen.frame * n + seen.point,
+            np.concatenate([s.frame[own.sample] * n + place for place in near]),
+        )
+        number = np.maximum(np.bincount(seen.point, minlength=n), 1)
+        sure = (np.bincount(seen.point, hit, n) / number > CONFIRMED)[seen.point]
+        parts.append(np.stack([look.distance, look.to_end, look.to_border])[:, sure])
+        found.append(hit[sure])
+    return measured_sight(Look(*np.concatenate(parts, axis=1)), np.concatenate(found))
 
 
 def line_counts(
@@ -97,14 +126,15 @@ def line_counts(
     samples: Samples,
     feet: Feet,
     margin: float,
+    sight: SightModel,
 ) -> DriveCounts:
     """Counts of one drive at the stations of lines with element ``ids`` (one per line)."""
     n = len(stations)
-    seen = views(stations.xy, traversal.pose, traversal.range_m, traversal.occluders, margin=margin)
-    fade = np.clip(stations.to_end / END_FADE, 0.15, 1.0)
-    weight = view_weight(seen.distance) * fade[seen.point]
-    keys, values = [], []
-    frame, value = samples.frame[feet.sample], detection_value(samples.score[feet.sample])
+    seen, look = looks(stations, traversal, margin)
+    weight = sight.weight(look)
+    keys, values, scores = [], [], []
+    frame, score = samples.frame[feet.sample], samples.score[feet.sample]
+    value = detection_value(score)
     wide = samples.spacing[feet.sample] > STEP
     for shift in (0, -1, 1):
         place = np.clip(feet.station + shift, 0, n - 1)
@@ -113,10 +143,12 @@ def line_counts(
         ok &= wide | (shift == 0) | (np.sign(feet.along) == shift)
         keys.append((frame * n + place)[ok])
         values.append(value[ok])
-    asked_key, asked_value = _asked_stations(stations, ids, traversal)
+        scores.append(score[ok])
+    asked_key, existence = _asked_stations(stations, ids, traversal)
     keys.append(asked_key)
-    values.append(asked_value)
-    return count(n, traversal, seen, weight, np.concatenate(keys), np.concatenate(values))
+    values.append(answer_value(existence))
+    scores.append(existence)
+    return count(n, seen, weight, *map(np.concatenate, (keys, values, scores)))
 
 
 def _asked_stations(
@@ -126,7 +158,6 @@ def _asked_stations(
     n, asked = len(stations), traversal.asked
     row = {name: k for k, name in enumerate(ids)}
     keys, values = [np.zeros(0, np.int64)], [np.zeros(0)]
-    sure = answer_value(asked.existence)
     for q, name in enumerate(asked.element_id):
         k = row.get(name)
         if k is None:
@@ -137,64 +168,114 @@ def _asked_stations(
         # Cheap and sufficient: the stretch asked about is the part of the line in its own box.
         index = index[((xy >= low) & (xy <= high)).all(axis=1)]
         keys.append(asked.frame[q] * n + index)
-        values.append(np.full(len(index), sure[q]))
+        values.append(np.full(len(index), asked.existence[q]))
     return np.concatenate(keys), np.concatenate(values)
 
 
 @dataclass(frozen=True)
 class Ballot:
-    """The drives' counts at n places, put together: ``votes`` (3, n), ``hits``, ``views`` summed,
-    ``in_view`` and ``seen`` (drives, n) flags, and the model that judged them."""
+    """The drives' counts at n places, put together: ``votes`` (drives, 3, n) log-likelihoods,
+    ``in_view`` and ``seen`` (drives, n) flags, and the model that judged them; ``extra`` (n,)
+    log-likelihood that other places lose when these do not exist."""
 
     votes: Array
-    hits: Array
-    views: Array
-    in_view: NDArray[np.bool_]
-    seen: NDArray[np.bool_]
-    frames_seen: Int
-    frames_in_view: Int
-    first_ns: Int
-    last_ns: Int
+    in_view: Mask
+    seen: Mask
+    drives: Sequence[DriveCounts]
+    times: Sequence[Int]
     runs: tuple[str, ...]
     model: VoteModel
+    extra: Array
+
+    @property
+    def hits(self) -> Array:
+        """(n,) summed over the drives."""
+        out: Array = np.sum([d.hits for d in self.drives], axis=0)
+        return out
+
+    @property
+    def views(self) -> Array:
+        """(n,) summed over the drives."""
+        out: Array = np.sum([d.views for d in self.drives], axis=0)
+        return out
 
     @property
     def evidence(self) -> Array:
         """(n,) log-likelihood ratio exists : absent."""
-        return log_odds_of(self.votes, self.model)
+        return log_odds_of(self.votes.sum(axis=0), self.model) + self.extra
 
     def counts(self, index: Int) -> Counts:
-        """Counts of the stretch of places ``index``: its best seen place speaks for frames."""
-        if not len(index):
-            return Counts()
-        share = self.seen[:, index].mean(axis=1) >= 0.3
-        first = self.first_ns[index]
-        first = first[first > 0]
+        """Counts of the stretch of places ``index``: frames that found or could see any of it."""
+        parts = [self._drive(k, index) for k in range(len(self.drives))] if len(index) else []
+        drives = sorted((p for p in parts if p is not None), key=lambda d: (d.time_ns, d.run_id))
+        times = [t for d in drives for t in d.seen_ns]
         return Counts(
-            frames_seen=int(self.frames_seen[index].max()),
-            frames_in_view=int(self.frames_in_view[index].max()),
-            traversals_seen=int(share.sum()),
-            traversals_in_view=int((self.in_view[:, index].mean(axis=1) >= 0.3).sum()),
-            first_seen_ns=int(first.min()) if len(first) else None,
-            last_seen_ns=int(self.last_ns[index].max()) or None,
-            runs=tuple(r for r, s in zip(self.runs, share, strict=True) if s),
+            frames_seen=sum(d.frames_seen for d in drives),
+            frames_in_view=sum(d.frames_in_view for d in drives),
+            traversals_seen=sum(d.seen for d in drives),
+            traversals_in_view=sum(d.looked for d in drives),
+            first_seen_ns=min(times, default=None),
+            last_seen_ns=max(times, default=None),
+            runs=tuple(sorted(d.run_id for d in drives if d.seen)),
+            drives=tuple(drives),
         )
+
+    def _drive(self, k: int, index: Int) -> DriveEvidence | None:
+        """What one drive says about the places ``index``; a frame speaks for them when it found
+        or could see half of what any frame of the drive did."""
+        drive, time = self.drives[k], self.times[k]
+        mine = np.zeros(self.votes.shape[-1], bool)
+        mine[index] = True
+        looked, found = mine[drive.view_place], mine[drive.hit_place]
+        if not looked.any():
+            return None
+        view_frames = _mostly(drive.view_frame[looked])
+        hit_frames = np.intersect1d(_mostly(drive.hit_frame[found]), view_frames)
+        score = drive.hit_score[found]
+        odds = log_odds_of(self.votes[k][:, index], self.model)
+        return DriveEvidence(
+            self.runs[k],
+            int(time[0]),
+            len(view_frames),
+            len(hit_frames),
+            tuple(int(t) for t in time[hit_frames]),
+            float(score.mean()) if len(score) else None,
+            float(odds.mean()),
+            bool(self.in_view[k, index].mean() >= 0.3),
+            bool(self.seen[k, index].mean() >= 0.3),
+        )
+
+
+def _mostly(frames: Int) -> Int:
+    """The frames that occur at least half as often as the commonest one."""
+    values, number = np.unique(frames, return_counts=True)
+    return values[2 * number >= number.max()] if len(values) else values
 
 
 def _without(drive: DriveCounts, old: int) -> DriveCounts:
     """The counts of a drive with nothing at the first ``old`` places."""
     mask = np.arange(len(drive.hits)) >= old
-    return DriveCounts(*(getattr(drive, name) * mask for name in drive.__dataclass_fields__))
+    view, hit = drive.view_place >= old, drive.hit_place >= old
+    return DriveCounts(
+        drive.hits * mask,
+        drive.views * mask,
+        drive.view_place[view],
+        drive.view_frame[view],
+        drive.hit_place[hit],
+        drive.hit_frame[hit],
+        drive.hit_score[hit],
+    )
 
 
 def ballot(
     drives: Sequence[DriveCounts],
-    runs: Sequence[str],
+    traversals: Sequence[Traversal],
     model: VoteModel,
-    fresh: NDArray[np.bool_] | None = None,
+    fresh: Mask | None = None,
     old: int = 0,
+    every: int = 1,
 ) -> Ballot:
-    """Put the drives together; the usual hit rate is measured on the places themselves.
+    """Put the drives together; the rates are measured on every ``every``-th place of the prior.
 
     The first ``old`` places are those of the prior, the others were picked by what was found. At
     the former only ``fresh`` drives vote: what the others said is in the prior already.
@@ -203,27 +284,16 @@ def ballot(
         drives = [d if f else _without(d, old) for d, f in zip(drives, fresh, strict=True)]
     hits = np.stack([d.hits for d in drives])
     looked = np.stack([d.views for d in drives])
-    found = usual_rate(hits.sum(axis=0), looked.sum(axis=0), model.found)
-    model = model.with_found(found)
-    votes = np.zeros((3, hits.shape[1]))
+    model = fitted(hits[:, :old:every], looked[:, :old:every], model)
     picked = np.arange(hits.shape[1]) >= old
-    seen = np.zeros(hits.shape, bool)
-    for k in range(len(drives)):
-        vote = drive_log_likelihoods(hits[k], looked[k], model, picked)
-        votes += vote
-        seen[k] = (looked[k] > 0) & (hits[k] >= SEEN_SHARE * model.found * looked[k])
-    first = np.stack([np.where(d.first_ns > 0, d.first_ns, np.iinfo(np.int64).max) for d in drives])
-    start = first.min(axis=0)
+    votes = [drive_log_likelihoods(h, v, model, picked) for h, v in zip(hits, looked, strict=True)]
     return Ballot(
-        votes,
-        hits.sum(axis=0),
-        looked.sum(axis=0),
+        np.stack(votes),
         looked >= 1.0,
-        seen,
-        np.sum([d.frames_seen for d in drives], axis=0),
-        np.sum([d.frames_in_view for d in drives], axis=0),
-        np.where(start == np.iinfo(np.int64).max, 0, start),
-        np.max([d.last_ns for d in drives], axis=0),
-        tuple(runs),
+        (looked > 0) & (hits >= SEEN_SHARE * model.found * looked),
+        drives,
+        [t.timestamp_ns for t in traversals],
+        tuple(t.run_id for t in traversals),
         model,
+        np.zeros(hits.shape[1]),
     )

@@ -1,0 +1,176 @@
+"""Exclusive assignment: in one frame a place of a line is seen once, by the likeliest detection.
+
+Two detections of one frame side by side are two lines, even where both lie near the same one: the
+likelier keeps it, the other goes to the next line or stays loose.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.maps.stations import (
+    GATE,
+    MIN_STRETCH,
+    Feet,
+    Samples,
+    Stations,
+    assign,
+    candidate_feet,
+)
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+PLACE = 2.0
+"""Length (m) of a line that one frame sees once; vertices of detections lie nearer than that."""
+FLOOR = 0.12
+"""Standard deviation (m) of the map and of the pose, beside that of a detection."""
+
+
+def across_sigma(samples: Samples) -> Array:
+    """(n,) standard deviation of each sample across its own detection, metres."""
+    normal = np.stack([-samples.tangent[:, 1], samples.tangent[:, 0]], axis=-1)
+    return np.sqrt(np.einsum("ni,nij,nj->n", normal, samples.covariance, normal))
+
+
+def sigma_scale(stations: Stations, samples: Samples) -> float:
+    """By how much the stated sigmas of a drive are too small (> 1) or too large (< 1).
+
+    Robust: the median of |offset| / sigma over what lies at a line of the map, against that of a
+    unit Gaussian (0.674); 1 while little was measured.
+    """
+    feet, _ = assign(stations, samples)
+    if len(feet) < 100:
+        return 1.0
+    sigma = np.sqrt(across_sigma(samples)[feet.sample] ** 2 + FLOOR**2)
+    return float(np.clip(np.median(np.abs(feet.offset) / sigma) / 0.674, 0.5, 2.0))
+
+
+def offset_sigma(stations: Stations, samples: Samples) -> Array:
+    """(n,) standard deviation (m) of the samples' offsets from the lines that they belong to."""
+    scale = sigma_scale(stations, samples)
+    return np.sqrt((scale * across_sigma(samples)) ** 2 + FLOOR**2)
+
+
+def assign_once(
+    stations: Stations,
+    samples: Samples,
+    first: Mask | None = None,
+    gate: float = GATE,
+    rounds: int = 4,
+) -> tuple[Feet, Mask]:
+    """Assign stretches of detections to strands, and say which samples found one.
+
+    A detection goes to the strand of largest gain Σ spacing · (1 − (offset / gate)²); of those of
+    one frame at one place of a strand the one of largest mean gain stays. What is left goes to the
+    next one, for ``rounds`` rounds. With ``first`` (stations,) the lines of these stations
+    choose before all others.
+    """
+    taken = np.zeros(len(samples), bool)
+    parts: list[Feet] = []
+    if len(stations) and len(samples):
+        feet = _Feet(stations, samples, gate)
+        stages = [None] if first is None else [first, ~first]
+        for stage in stages:
+            for _ in range(rounds):
+                chosen = feet.round(taken, stage)
+                if not len(chosen):
+                    break
+                parts.append(feet.pick(chosen))
+                taken[feet.sample[chosen]] = True
+    if not parts:
+        nothing = np.zeros(0, np.int64)
+        return Feet(nothing, nothing, np.zeros(0), np.zeros(0)), taken
+    names = ("sample", "station", "offset", "along")
+    return Feet(*(np.concatenate([getattr(p, n) for p in parts]) for n in names)), taken
+
+
+def sides(samples: Samples) -> Int:
+    """(n,) 2 · detection, + 1 where it runs against its own beginning: around the tip of an
+    island one detection sees both sides, which are two lines."""
+    start = np.searchsorted(samples.detection, samples.detection)
+    back = (samples.tangent * samples.tangent[start]).sum(axis=1) < 0
+    return 2 * samples.detection + back
+
+
+class _Feet:
+    """The best foot of each sample on each strand in reach, and which of them are still free."""
+
+    def __init__(self, stations: Stations, samples: Samples, gate: float) -> None:
+        unit = stations.strand
+        feet = candidate_feet(stations, samples, gate, unit)
+        self.sample, self.station, self.offset, self.along = feet
+        self.weight = samples.spacing[self.sample]
+        self.gain = 1.0 - (self.offset / gate) ** 2
+        part = sides(samples)
+        self.detection = part[self.sample]
+        self.strands = int(unit.max()) + 1
+        self.pair = self.detection * self.strands + unit[self.station]
+        # One place of a line in one frame.
+        place = np.floor(stations.s / PLACE).astype(np.int64)
+        size = int(place.max()) + 1
+        where = stations.line * size + place
+        count = int(where.max()) + 1
+        self.slot = samples.frame[self.sample] * count + where[self.station]
+        self.free = np.ones(len(self.sample), bool)
+        total = np.bincount(part, samples.spacing)
+        self.least = np.minimum(MIN_STRETCH, 0.6 * total)
+
+    def pick(self, index: Int) -> Feet:
+        """Some of the feet."""
+        return Feet(self.sample[index], self.station[index], self.offset[index], self.along[index])
+
+    def round(self, taken: Mask, stage: Mask | None) -> Int:
+        """The feet that are accepted now; places that they fill are closed to others."""
+        open_ = self.free & ~taken[self.sample]
+        if stage is not None:
+            open_ &= stage[self.station]
+        index = np.flatnonzero(open_)
+        if not len(index):
+            return index
+        pairs, inverse = np.unique(self.pair[index], return_inverse=True)
+        weight = self.weight[index]
+        gain = np.bincount(inverse, weight * self.gain[index])
+        cover = np.bincount(inverse, weight)
+        owner = pairs // self.strands
+        enough = cover >= self.least[owner]
+        order = np.lexsort((pairs, -np.where(enough, gain, -1.0), owner))
+        best = np.zeros(len(pairs), bool)
+        best[order] = np.concatenate([[True], owner[order][1:] != owner[order][:-1]])
+        wanted = (best & enough)[inverse]
+        mean = (gain / np.maximum(cover, 1e-9))[inverse][wanted]
+        index = index[wanted]
+        if not len(index):
+            return index
+        winners = self._winners(index, mean)
+        # What lost most of its way along a line is another line, with its ends, too.
+        _, group = np.unique(self.pair[index], return_inverse=True)
+        won = np.bincount(group, self.weight[index] * winners) / np.bincount(
+            group, self.weight[index]
+        )
+        winners &= won[group] >= 0.5
+        self.free[index] = False
+        kept = index[winners]
+        self._close(kept)
+        return kept
+
+    def _close(self, kept: Int) -> None:
+        """Places filled by ``kept`` are closed to other detections of their frames."""
+        slots, first = np.unique(self.slot[kept], return_index=True)
+        at = np.minimum(np.searchsorted(slots, self.slot), max(len(slots) - 1, 0))
+        if len(slots):
+            filled = slots[at] == self.slot
+            self.free &= ~filled | (self.detection == self.detection[kept][first][at])
+
+    def _winners(self, index: Int, mean: Array) -> Mask:
+        """Of the feet ``index``, those whose detection is the likeliest at their place."""
+        slot, detection = self.slot[index], self.detection[index]
+        order = np.lexsort((detection, -mean, slot))
+        start = np.concatenate([[True], slot[order][1:] != slot[order][:-1]])
+        group = np.cumsum(start) - 1
+        best = detection[order][start][group]
+        out = np.zeros(len(index), bool)
+        out[order] = detection[order] == best
+        return out

@@ -1,0 +1,69 @@
+"""Strands: chains cut where they fold, so that a detection cannot hop between their two sides.
+
+The outline of a lane is often one chain with both its sides, joined at the end of a bay or around
+an island. As a line it is one thing; for a detection beside it the two sides are two lines.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from rtmap_cli.maps.stations import Stations
+
+Int = NDArray[np.int64]
+
+BESIDE = 3.0
+"""Two parts of a chain nearer than this (m) are two sides of it …"""
+AWAY = 10.0
+"""… when the way along the chain is longer than this (m)."""
+
+
+def strands_of(stations: Stations) -> Int:
+    """(n,) number of the strand of each station: a line, or the part of it before it folds back,
+    joined with the next lines of its chain as long as they do not run beside it."""
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(stations.xy).query_pairs(BESIDE, output_type="ndarray").astype(np.int64)
+    same = stations.chain[pairs[:, 0]] == stations.chain[pairs[:, 1]]
+    pairs = np.sort(pairs[same], axis=1)
+    part = _parts(stations, pairs)
+    group = np.arange(int(part.max(initial=-1)) + 1)
+    near = np.flatnonzero(part[pairs[:, 0]] != part[pairs[:, 1]])
+    a, b = pairs[near].T
+    touching = np.hypot(*(stations.xy[a] - stations.xy[b]).T) < 0.05
+    # Parts of one line were cut because they fold: they stay apart.
+    touching &= stations.line[a] != stations.line[b]
+    for k in np.flatnonzero(touching):
+        one, other = group[part[a[k]]], group[part[b[k]]]
+        if one == other:
+            continue
+        joint = stations.xy[a[k]]
+        across = (group[part[a]] == one) & (group[part[b]] == other)
+        across |= (group[part[a]] == other) & (group[part[b]] == one)
+        far = [np.hypot(*(stations.xy[i] - joint).T) > AWAY / 2 for i in (a, b)]
+        if not (across & far[0] & far[1]).any():
+            group[group == other] = one
+    return np.asarray(group[part], np.int64)
+
+
+def _parts(stations: Stations, pairs: Int) -> Int:
+    """(n,) number of the part of each station: lines, cut where they come back to themselves."""
+    own = pairs[stations.line[pairs[:, 0]] == stations.line[pairs[:, 1]]]
+    a, b = own.T
+    turned = (stations.tangent[a] * stations.tangent[b]).sum(axis=1) < 0
+    back = turned & (stations.s[b] - stations.s[a] > AWAY)
+    # Of every station the last one before it that it comes back to.
+    last = np.full(len(stations), -1)
+    np.maximum.at(last, b[back], a[back])
+    part = np.zeros(len(stations), np.int64)
+    number, start = -1, 0
+    for k in range(len(stations)):
+        first = k == 0 or stations.line[k] != stations.line[k - 1]
+        if first or last[k] >= start:
+            number, start = number + 1, k
+        part[k] = number
+    return part
