@@ -165,7 +165,7 @@ def figures(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
     point = found[need - 1] if 0 < need <= len(found) else None
     told = np.array(found + false.tolist())
     real = np.arange(len(told)) < len(found)
-    kinds = {}
+    kinds: dict[str, dict[str, int]] = {}
     for r in rows:
         counts = kinds.setdefault(r[2], {"found": 0, "missed": 0, "false": 0})
         weak = r[0] == "found" and r[1] < TOLD

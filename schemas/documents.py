@@ -184,11 +184,26 @@ def _changes_geojson() -> Node:
         "first_seen_ns": _or_null(_integer("ns since 1970-01-01T00:00:00Z")),
         "last_seen_ns": _or_null(_integer("ns since 1970-01-01T00:00:00Z")),
         "runs": _texts("ids of the runs behind it"),
+        "evidence": {"type": "array", "items": _drive_evidence()},
     }
     own = _object(_versioned(CHANGES_SCHEMA, CHANGES_VERSION), ["schema", "schema_version"])
     geometry = _geometry("LineString", "Polygon")
     node = _collection(properties, list(properties), geometry, rtmap=own)
     return _document(CHANGES_SCHEMA, "what `rtmap detect-changes` writes", node)
+
+
+def _drive_evidence() -> Node:
+    """What one drive says about a change."""
+    properties = {
+        "run": _text("id of the run"),
+        "frames_seen": _integer("frames that found the element"),
+        "frames_in_view": _integer("frames that could have"),
+        "seen_ns": {"type": "array", "items": _integer("time of a frame that found it")},
+        "score": _or_null(_number("mean score of what they found")),
+        "log_odds": _number("that the element exists, by this run alone"),
+        "found": {"type": "boolean", "description": "its vote"},
+    }
+    return _object(properties, list(properties))
 
 
 def _map_properties() -> Node:

@@ -60,10 +60,16 @@ def _parts(stations: Stations, pairs: Int) -> Int:
     last = np.full(len(stations), -1)
     np.maximum.at(last, b[back], a[back])
     part = np.zeros(len(stations), np.int64)
-    number, start = -1, 0
+    number, start, row = -1, 0, 0
     for k in range(len(stations)):
         first = k == 0 or stations.line[k] != stations.line[k - 1]
-        if first or last[k] >= start:
-            number, start = number + 1, k
+        if first:
+            number, start, row = number + 1, k, k
+        elif last[k] >= start:
+            # The tip lies halfway between the two stations.
+            middle = (stations.s[last[k]] + stations.s[k]) / 2
+            start = row + int(np.searchsorted(stations.s[row:k], middle))
+            number += 1
+            part[start:k] = number
         part[k] = number
     return part

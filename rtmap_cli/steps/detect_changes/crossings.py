@@ -25,6 +25,8 @@ Int = NDArray[np.int64]
 
 NEAR = 3.5
 """Rings whose features (centre, direction) differ by more than this (m) are different ones."""
+SIGMAS = 3.0
+"""… unless their own position is known no better than so many standard deviations allow."""
 VISIBLE = 0.65
 """A ring is in view of a frame when this share of its outline and middle is."""
 INSIDE = 0.6
@@ -38,7 +40,8 @@ RING_MARGIN = 0.5
 @dataclass(frozen=True)
 class Rings:
     """Detected rings of one drive: ``points`` (n, 80, 2) counter-clockwise, ``variance`` (n,) mean
-    per axis (m²), ``score``, ``frame``, ``cut`` by the range, ``feature`` (n, 4)."""
+    per axis (m²), ``score``, ``frame``, ``cut`` by the range, ``feature`` (n, 4), ``window``
+    (n, 4, 2) corners of the range of its frame in the map frame (None: unlimited)."""
 
     points: Array
     variance: Array
@@ -46,6 +49,7 @@ class Rings:
     frame: Int
     cut: NDArray[np.bool_]
     feature: Array
+    window: Array | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -79,32 +83,63 @@ def class_rings(traversal: Traversal, class_name: str) -> Rings:
         traversal.frame[index],
         traversal.cut[index],
         features(points) if len(index) else np.zeros((0, 4)),
+        _windows(traversal, traversal.frame[index]),
     )
 
 
-def match(rings: Rings, places: Array, near: float = NEAR) -> Int:
+def _windows(traversal: Traversal, frame: Int) -> Array:
+    """(n, 4, 2) corners of the range of some frames in the map frame."""
+    x0, y0, x1, y1 = traversal.range_m
+    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    pose = traversal.pose[frame]
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=-2)
+    return np.einsum("nij,kj->nki", turn, corners) + pose[:, None, :2]
+
+
+def match(rings: Rings, places: Array, first: int = 0) -> Int:
     """(n,) index of the place (m, 80, 2) that each detection belongs to, or -1.
 
-    The nearest in the feature space; a detection cut by the range may also overlap the place
-    by 15 % of the union, or lie in it with `INSIDE` of its own area, because its centre is not the
-    centre of the element.
+    The nearest in the feature space within ``NEAR``, or ``SIGMAS`` of the detection where that is
+    more; one frame sees a place once, by its nearest detection. The ``first`` places choose before
+    the others. A piece of a place belongs to it, too, although its centre is not the centre of the
+    element: where it overlaps it, or is what the range leaves of it.
     """
-    from scipy.spatial import cKDTree
-
     out = np.full(len(rings), -1)
     if not len(places) or not len(rings):
         return out
-    distance, nearest = cKDTree(features(places)).query(rings.feature)
-    out[distance <= near] = nearest[distance <= near]
-    left = np.flatnonzero(out < 0)
-    if not len(left):
-        return out
+    from scipy.spatial import cKDTree
+
+    gate = np.clip(SIGMAS * np.sqrt(rings.variance), NEAR, 2 * NEAR)
+    near = cKDTree(rings.feature).sparse_distance_matrix(
+        cKDTree(features(places)), 2 * NEAR, output_type="ndarray"
+    )
+    near = near[near["v"] <= gate[near["i"]]]
+    i, j = near["i"], near["j"]
+    later = j >= first if first else np.zeros(len(j), bool)
+    taken: set[tuple[int, int]] = set()
+    for k in np.lexsort((j, i, near["v"], later)).tolist():
+        slot = (int(rings.frame[i[k]]), int(j[k]))
+        if out[i[k]] < 0 and slot not in taken:
+            out[i[k]] = j[k]
+            taken.add(slot)
+    for pieces in (_overlapping, _cut_places):
+        left = np.flatnonzero(out < 0)
+        if len(left):
+            out[left] = pieces(rings, left, gate[left], places)
+    return out
+
+
+def _overlapping(rings: Rings, rows: Int, gate: Array, places: Array) -> Int:
+    """(k,) which place each of the detections ``rows`` overlaps by 15 % of the union or lies in
+    with `INSIDE` of its own area, or -1; ``gate`` does not matter."""
+    out = np.full(len(rows), -1)
     centres, radius = places.mean(axis=1), np.ptp(places, axis=1).max(axis=1)
-    reach = np.hypot(*np.moveaxis(rings.feature[left, None, :2] - centres, -1, 0))
+    reach = np.hypot(*np.moveaxis(rings.feature[rows, None, :2] - centres, -1, 0))
     k, j = np.nonzero(reach < radius)
     if not len(k):
         return out
-    mine = np.array([polygon(p) for p in rings.points[left]], object)[k]
+    mine = np.array([polygon(p) for p in rings.points[rows]], object)[k]
     theirs = np.array([polygon(p) for p in places], object)[j]
     common, own, other = shapely.area(np.stack([shapely.intersection(mine, theirs), mine, theirs]))
     share = common / np.maximum(own + other - common, 1e-12)
@@ -113,8 +148,35 @@ def match(rings: Rings, places: Array, near: float = NEAR) -> Int:
     some = np.unique(k[meets])
     # Of those that it overlaps it belongs to the one that holds most of it.
     order = np.lexsort((j, -within, k))
-    first = order[np.searchsorted(k[order], some)]
-    out[left[some]] = j[first]
+    out[some] = j[order[np.searchsorted(k[order], some)]]
+    return out
+
+
+def _cut_places(rings: Rings, rows: Int, gate: Array, places: Array) -> Int:
+    """(k,) which place each of the detections ``rows`` is what the range leaves of, or -1: the
+    place whose part in the range has its middle nearest to the detection's, within ``gate``."""
+    out = np.full(len(rows), -1)
+    if rings.window is None:
+        return out
+    centres, radius = places.mean(axis=1), np.ptp(places, axis=1).max(axis=1)
+    middle = rings.feature[rows, :2]
+    reach = np.hypot(*np.moveaxis(middle[:, None] - centres, -1, 0))
+    k, j = np.nonzero(reach < radius + gate[:, None])
+    if not len(k):
+        return out
+    window = shapely.polygons(rings.window[rows])
+    whole = np.array([polygon(p) for p in places], object)
+    part = shapely.intersection(whole[j], window[k])
+    area = shapely.area(part)
+    # A place that lies wholly in the range would have been seen whole.
+    cut = (area > 1.0) & (area < 0.9 * shapely.area(whole[j]))
+    k, j, part = k[cut], j[cut], part[cut]
+    away = np.hypot(*(shapely.get_coordinates(shapely.centroid(part)) - middle[k]).T)
+    near = away < gate[k]
+    k, j, away = k[near], j[near], away[near]
+    order = np.lexsort((j, away, k))
+    some, first = np.unique(k[order], return_index=True)
+    out[some] = j[order][first]
     return out
 
 
@@ -232,14 +294,18 @@ def ring_counts(
     ids: Sequence[str],
     traversals: Sequence[Traversal],
     drives: Sequence[Rings],
-) -> list[DriveCounts]:
-    """Counts of every drive on closed elements ``places`` (n, 80, 2) with element ``ids``."""
+    first: int = 0,
+) -> tuple[list[DriveCounts], list[Int]]:
+    """Counts of every drive on closed elements ``places`` (n, 80, 2) with element ``ids``, and to
+    which of them its detections belong; the ``first`` places choose before the others."""
     n = len(places)
     row = {name: k for k, name in enumerate(ids)}
     counts: list[DriveCounts] = []
+    owners: list[Int] = []
     for traversal, rings in zip(traversals, drives, strict=True):
         seen, weight = _ring_views(places, traversal)
-        owner = match(rings, places)
+        owner = match(rings, places, first)
+        owners.append(owner)
         hit = owner >= 0
         asked = traversal.asked
         known = np.array([row.get(name, -1) for name in asked.element_id], np.int64)
@@ -249,4 +315,4 @@ def ring_counts(
         score = [rings.score[hit], asked.existence[known >= 0]]
         value = np.concatenate([detection_value(score[0]), answer_value(score[1])])
         counts.append(count(n, seen, weight, key, value, np.concatenate(score)))
-    return counts
+    return counts, owners

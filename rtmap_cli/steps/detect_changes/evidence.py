@@ -38,7 +38,7 @@ from rtmap_cli.steps.detect_changes.lines import (
     new_lines,
     refit_lines,
 )
-from rtmap_cli.steps.detect_changes.rivals import neighbours, questioned, weighed
+from rtmap_cli.steps.detect_changes.rivals import neighbours, questioned, weighed, weighed_rings
 from rtmap_cli.steps.detect_changes.votes import Ballot, ballot, sight_of
 
 Array = NDArray[np.float64]
@@ -341,8 +341,11 @@ def _rings(
         return []
     elements = list(prior) + [Element(new_id(name, r), name, close(r)) for r in found]
     ids = [e.element_id for e in elements]
-    counts = ring_counts(places, ids, traversals, drives)
+    counts, owners = ring_counts(places, ids, traversals, drives)
     votes = ballot(counts, traversals, settings.votes, fresh, len(prior))
+    if len(found) and len(old):
+        alone = ring_counts(places, ids, traversals, drives, first=len(old))
+        votes = weighed_rings(votes, (counts, owners), alone, drives, places, len(old))
     return [
         _ring_evidence(e, k, votes, settings, newest_ns(traversals), new=k >= len(prior))
         for k, e in enumerate(elements)

@@ -25,6 +25,7 @@ from rtmap_cli.maps.existence import (
     probability,
 )
 from rtmap_cli.maps.stations import GATE, MIN_COS, Feet, Stations
+from rtmap_cli.steps.detect_changes.crossings import Rings
 from rtmap_cli.steps.detect_changes.votes import Ballot, DriveCounts
 
 Array = NDArray[np.float64]
@@ -33,6 +34,8 @@ Mask = NDArray[np.bool_]
 
 BESIDE = 2 * GATE
 """Lines nearer to each other than this (m) compete for detections."""
+RING_BESIDE = 8.0
+"""Centres of crossings nearer than this (m) compete for detections."""
 MOST = 2.0
 """Log-odds that the offset of a whole drive is worth at most: errors have heavy tails."""
 OWN, CUT = 0.5, 1.3
@@ -189,3 +192,35 @@ def _owners(asked: Mask, pairs: Int, stations: Stations) -> tuple[Int, Int]:
     first[1:] = both[1:, 0] != both[:-1, 0]
     giver, taker = both[first].T
     return giver, taker
+
+
+def weighed_rings(
+    votes: Ballot,
+    full: tuple[Sequence[DriveCounts], Sequence[Int]],
+    without: tuple[Sequence[DriveCounts], Sequence[Int]],
+    drives: Sequence[Rings],
+    places: Array,
+    old: int,
+) -> Ballot:
+    """The votes on closed elements ``places`` (n, 80, 2) with the ``extra`` evidence of the new
+    ones, from ``old`` on; counts and owners as ``ring_counts`` gives them, in ``without`` those of
+    the map chose first."""
+    picked = np.arange(len(places)) >= old
+    extra = votes.extra.copy()
+    with_, alone = (_total(p[0], votes.model, picked) for p in (full, without))
+    extra[picked] += (with_[2] - alone[2])[picked]
+    lost = np.minimum(_marginal(with_, votes.model) - _marginal(alone, votes.model), 0.0)
+    centre = places.mean(axis=1)
+    apart = np.hypot(*np.moveaxis(centre[:old, None] - centre[None, old:], -1, 0))
+    nearest = apart.argmin(axis=1)
+    np.add.at(extra, old + nearest, np.where(apart.min(axis=1) < RING_BESIDE, lost[:old], 0.0))
+    for one, other, rings in zip(full[1], without[1], drives, strict=True):
+        moved = (one >= old) & (other >= 0) & (other != one)
+        here, there = centre[one[moved]], centre[other[moved]]
+        where = rings.points[moved].mean(axis=1)
+        far = ((where - there) ** 2).sum(axis=1) - ((where - here) ** 2).sum(axis=1)
+        number = np.bincount(one[moved], minlength=len(places))
+        strain = np.bincount(one[moved], far / rings.variance[moved] / 2, len(places))
+        share = number / np.maximum(np.bincount(one[one >= 0], minlength=len(places)), 1)
+        extra += share * np.clip(strain / np.maximum(number, 1), -MOST, MOST)
+    return replace(votes, extra=extra)

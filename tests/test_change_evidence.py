@@ -1,0 +1,191 @@
+"""What stands behind a change: rivals side by side, evidence per drive, policies, false alarms."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fusion_scene import CRS, drive, line, save, street
+
+from rtmap_cli.formats.changes import ChangeEvent
+from rtmap_cli.maps.element import Element, VectorMap
+from rtmap_cli.maps.evidence import Counts, DriveEvidence, Policy, prior_log_odds
+from rtmap_cli.maps.policy import read_policy
+from rtmap_cli.maps.store import read_map, write_new_map
+from rtmap_cli.steps.detect_changes.events import within_budget
+
+Call = Callable[..., Any]
+
+DAY = 86_400 * 10**9
+
+
+def _told(
+    rtmap: Call, tmp_path: Path, prior: VectorMap, runs: list[Any], *options: object, code: int = 0
+) -> Any:
+    write_new_map(prior, tmp_path / "map", "prior")
+    folders = [save(r, tmp_path / "runs" / r.log_id) for r in runs]
+    out = tmp_path / "changes.geojson"
+    result = rtmap(
+        "detect-changes", *folders, "--map", tmp_path / "map", "-o", out, *options, code=code
+    )
+    return json.loads(out.read_text())["features"] if code == 0 else result
+
+
+def test_a_new_line_beside_one_of_the_map_is_told(rtmap: Call, tmp_path: Path) -> None:
+    world = street(line("bike", "divider", 1.2, 30, 60))
+    runs = [drive(world, f"d{k}", seed=k) for k in range(2)]
+    (found,) = _told(rtmap, tmp_path, street(), runs)
+    assert found["properties"]["kind"] == "insert" and found["properties"]["class"] == "divider"
+    assert found["properties"]["traversals_seen"] == 2
+
+
+def test_a_line_that_is_gone_beside_one_that_stays_is_told(rtmap: Call, tmp_path: Path) -> None:
+    prior = street(line("bike", "divider", 1.2, 30, 60))
+    runs = [drive(street(), f"d{k}", seed=k) for k in range(2)]
+    (found,) = _told(rtmap, tmp_path, prior, runs)
+    assert found["properties"]["kind"] == "delete"
+    assert found["properties"]["element_id"] == "bike"
+
+
+def test_two_lines_that_both_stay_are_no_change(rtmap: Call, tmp_path: Path) -> None:
+    world = street(line("bike", "divider", 1.2, 30, 60))
+    runs = [drive(world, f"d{k}", seed=k, noise=0.25) for k in range(2)]
+    assert _told(rtmap, tmp_path, world, runs) == []
+
+
+def test_every_change_carries_its_frames_runs_and_scores(rtmap: Call, tmp_path: Path) -> None:
+    prior = street(without=["lane"])
+    runs = [drive(street(), f"d{k}", seed=k) for k in range(2)]
+    (found,) = _told(rtmap, tmp_path, prior, runs)
+    evidence = found["properties"]["evidence"]
+    assert [e["run"] for e in evidence] == ["d0", "d1"]
+    for e, run in zip(evidence, runs, strict=True):
+        assert 0 < e["frames_seen"] == len(e["seen_ns"]) <= e["frames_in_view"]
+        assert set(e["seen_ns"]) <= set(run.frames.timestamp_ns.tolist())
+        assert 0.6 <= e["score"] <= 0.9 and e["log_odds"] > 0 and e["found"]
+    assert sum(e["frames_seen"] for e in evidence) == found["properties"]["frames_seen"]
+
+
+def test_what_misses_says_so_drive_by_drive(rtmap: Call, tmp_path: Path) -> None:
+    runs = [drive(street(without=["west"]), f"d{k}", seed=k) for k in range(2)]
+    (found,) = _told(rtmap, tmp_path, street(), runs)
+    for e in found["properties"]["evidence"]:
+        assert e["frames_in_view"] > 5 and e["frames_seen"] == 0 and e["score"] is None
+        assert e["log_odds"] < 0 and not e["found"]
+
+
+def test_a_drive_that_never_looks_leaves_existence_as_it_is(rtmap: Call, tmp_path: Path) -> None:
+    write_new_map(street(), tmp_path / "map", "prior")
+    base = ("crowdsource", tmp_path / "runs", "--map", tmp_path / "map")
+    save(drive(street(), "d0"), tmp_path / "runs" / "d0")
+    rtmap(*base)
+    before = read_map(tmp_path / "map").by_id()["east"]
+    # 40 m of street, the crossing lies 20 m beyond the range of its last frame.
+    save(drive(street(), "d1", seed=1, span=(0.0, 25.0)), tmp_path / "runs" / "d1")
+    rtmap(*base)
+    after = read_map(tmp_path / "map").by_id()
+    assert after["east"].existence == before.existence
+    assert (after["east"].in_view, after["east"].traversals) == (before.in_view, 1)
+    assert after["west"].traversals == 2 and after["west"].existence > before.existence
+
+
+def _event(name: str, p: float) -> ChangeEvent:
+    return ChangeEvent(name, "insert", "divider", None, np.zeros((2, 2)), p, 0.0, Counts())
+
+
+def test_as_many_changes_as_the_expected_false_alarms_allow() -> None:
+    events = [_event("a", 0.99), _event("b", 0.9), _event("c", 0.6), _event("d", 0.9)]
+
+    def told(per_km: float) -> list[str]:
+        return [e.change_id for e in within_budget(events, 2.0, per_km)]
+
+    assert told(0.005) == ["a"] and told(0.0) == []
+    # b and d are equally probable: 0.01 + 0.1 allows one of them, which says nothing.
+    assert told(0.06) == ["a"]
+    assert told(0.11) == ["a", "b", "d"] and told(1.0) == ["a", "b", "d", "c"]
+
+
+def test_the_budget_of_false_alarms_on_the_command_line(rtmap: Call, tmp_path: Path) -> None:
+    runs = [drive(street(without=["west"]), f"d{k}", seed=k) for k in range(3)]
+    assert len(_told(rtmap, tmp_path / "a", street(), runs, "--max-false-alarms-per-km", 1)) == 1
+    assert _told(rtmap, tmp_path / "b", street(), runs, "--max-false-alarms-per-km", 0) == []
+
+
+def test_a_policy_file_decides_and_the_command_line_above_it(rtmap: Call, tmp_path: Path) -> None:
+    policy = tmp_path / "policy.toml"
+    policy.write_text("[tell]\nmin_probability = 1.0\n[evidence]\nprior_log_odds = 1.0\n")
+    runs = [drive(street(without=["west"]), f"d{k}", seed=k) for k in range(2)]
+    assert _told(rtmap, tmp_path / "a", street(), runs, "--policy", policy) == []
+    options = ("--policy", policy, "--min-probability", 0.5)
+    (found,) = _told(rtmap, tmp_path / "b", street(), runs, *options)
+    (usual,) = _told(rtmap, tmp_path / "c", street(), runs)
+    difference = usual["properties"]["log_odds"] - found["properties"]["log_odds"]
+    assert difference == pytest.approx(1.0 - Policy().prior_log_odds, abs=1e-3)
+
+
+def test_what_a_policy_file_leaves_out_is_the_default(tmp_path: Path) -> None:
+    path = tmp_path / "policy.toml"
+    path.write_text("")
+    assert read_policy(path) == Policy()
+    path.write_text("[delete]\ntraversals = 3\nof = 4\n[age]\nhalf_life_days = 30\n")
+    policy = read_policy(path)
+    assert (policy.delete_traversals, policy.delete_of, policy.half_life_days) == (3, 4, 30.0)
+    assert policy.insert_above == Policy().insert_above
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("[delete", "TOML"),
+        ("[remove]\nbelow = 0.1", "remove"),
+        ("delete = 3", "table"),
+        ("[delete]\nunder = 0.1", "under"),
+        ("[delete]\nbelow = 1.5", "below"),
+        ("[delete]\nbelow = nan", "below"),
+        ("[delete]\nbelow = true", "below"),
+        ("[delete]\ntraversals = 1.5", "whole"),
+        ("[delete]\ntraversals = 6", "exceed"),
+        ("[delete]\nbelow = 0.9", "insert"),
+    ],
+)
+def test_a_bad_policy_is_one_line(rtmap: Call, tmp_path: Path, text: str, word: str) -> None:
+    path = tmp_path / "policy.toml"
+    path.write_text(text)
+    runs = [drive(street(), "d0")]
+    result = _told(rtmap, tmp_path, street(), runs, "--policy", path, code=3)
+    assert word in result.err and len(result.err.strip().splitlines()) == 1
+    assert not (tmp_path / "changes.geojson").exists()
+
+
+def _vote(time: int, seen: bool, looked: bool = True) -> DriveEvidence:
+    return DriveEvidence(f"r{time}", time, 9, 9 * seen, (), None, 0.0, looked, seen)
+
+
+def test_the_newest_drives_that_looked_are_counted() -> None:
+    drives = (_vote(1, True), _vote(2, True), _vote(3, False), _vote(4, False, False))
+    counts = Counts(drives=(*drives, _vote(5, False)))
+    assert counts.newest(2) == (0, 2)
+    assert counts.newest(3) == (1, 3)
+    assert counts.newest(0) == (2, 4)
+
+
+def test_what_a_map_says_fades_with_age() -> None:
+    old = Element(
+        "e", "divider", np.zeros((2, 2)), existence=6.0, traversals=3, last_seen_ns=100 * DAY
+    )
+    assert prior_log_odds(old, Policy(), 130 * DAY) == 6.0
+    fading = Policy(half_life_days=30.0)
+    assert prior_log_odds(old, fading, 130 * DAY) == pytest.approx(3.0)
+    assert prior_log_odds(old, fading, 100 * DAY) == 6.0
+    fresh = Element("e", "divider", np.zeros((2, 2)))
+    assert prior_log_odds(fresh, fading, 130 * DAY) == Policy().prior_log_odds
+
+
+def test_runs_in_another_crs_are_still_refused(rtmap: Call, tmp_path: Path) -> None:
+    other = drive(street(), "d0", crs="EPSG:32618")
+    assert other.crs != CRS
+    assert "EPSG" in _told(rtmap, tmp_path, street(), [other], code=3).err
