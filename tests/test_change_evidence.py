@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fusion_scene import CRS, drive, line, save, street
+from fusion_scene import CRS, ORIGIN, drive, line, save, street
 
 from rtmap_cli.formats.changes import ChangeEvent
 from rtmap_cli.maps.element import Element, VectorMap
@@ -91,6 +91,29 @@ def test_a_drive_that_never_looks_leaves_existence_as_it_is(rtmap: Call, tmp_pat
     assert after["east"].existence == before.existence
     assert (after["east"].in_view, after["east"].traversals) == (before.in_view, 1)
     assert after["west"].traversals == 2 and after["west"].existence > before.existence
+
+
+def test_a_stretch_goes_from_a_line_that_was_sure_drive_by_drive(
+    rtmap: Call, tmp_path: Path
+) -> None:
+    write_new_map(street(), tmp_path / "map", "prior")
+    base = ("crowdsource", tmp_path / "runs", "--map", tmp_path / "map")
+    for k in range(4):
+        save(drive(street(), f"d{k}", seed=k), tmp_path / "runs" / f"d{k}")
+    rtmap(*base)
+    sure = read_map(tmp_path / "map").by_id()["lane"]
+    assert sure.existence > 8
+    world = street(
+        line("lane-a", "divider", 3.5, -20, 40), line("lane-b", "divider", 3.5, 60, 120),
+        without=["lane"],
+    )  # fmt: skip
+    for k in (4, 5):
+        save(drive(world, f"d{k}", seed=k), tmp_path / "runs" / f"d{k}")
+        rtmap(*base)
+    rest = read_map(tmp_path / "map").of_class("divider")
+    x = np.concatenate([e.xy[:, 0] - ORIGIN[0] for e in rest if e.xy[0, 1] - ORIGIN[1] > 2])
+    assert len(x) and not ((x > 44) & (x < 56)).any()
+    assert x.min() < -15 and x.max() > 115
 
 
 def _event(name: str, p: float) -> ChangeEvent:
@@ -177,10 +200,12 @@ def test_what_a_map_says_fades_with_age() -> None:
     old = Element(
         "e", "divider", np.zeros((2, 2)), existence=6.0, traversals=3, last_seen_ns=100 * DAY
     )
-    assert prior_log_odds(old, Policy(), 130 * DAY) == 6.0
-    fading = Policy(half_life_days=30.0)
+    lasting, fading = Policy(vanish=0.0), Policy(vanish=0.0, half_life_days=30.0)
+    assert prior_log_odds(old, lasting, 130 * DAY) == pytest.approx(6.0)
     assert prior_log_odds(old, fading, 130 * DAY) == pytest.approx(3.0)
-    assert prior_log_odds(old, fading, 100 * DAY) == 6.0
+    assert prior_log_odds(old, fading, 100 * DAY) == pytest.approx(6.0)
+    # The surest element may have gone with a chance of 1 %.
+    assert prior_log_odds(old, Policy(), 130 * DAY) < np.log(99) < 6.0
     fresh = Element("e", "divider", np.zeros((2, 2)))
     assert prior_log_odds(fresh, fading, 130 * DAY) == Policy().prior_log_odds
 

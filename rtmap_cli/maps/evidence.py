@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.maps.element import Element
-from rtmap_cli.maps.existence import PRIOR_LOG_ODDS, VoteModel
+from rtmap_cli.maps.existence import PRIOR_LOG_ODDS, VoteModel, logit, probability
 from rtmap_cli.maps.refit import FusionModel
 
 Array = NDArray[np.float64]
@@ -123,10 +123,11 @@ class Policy:
     drives that had an element in view must have missed it (all of them where there are fewer),
     ``insert_traversals`` of ``insert_of`` must have found a new one (n = 0: of all drives); where
     only one drive looked at a new element, one is enough only for a first map.
-    ``half_life_days``: the log-odds of an element halve in so many days after it was last seen,
-    before new votes count (0: never). ``min_probability``, ``max_false_alarms_per_km``: changes
-    that are told; ``prior_log_odds``, ``new_log_odds``: log-odds, before the votes, of an
-    element that states none and of a found candidate.
+    ``vanish``: chance that an element has gone since the drives before: however sure a map is, it
+    can learn; ``half_life_days``: the log-odds of an element halve in so many days after it was
+    last seen, before new votes count (0: never). ``min_probability``,
+    ``max_false_alarms_per_km``: changes that are told; ``prior_log_odds``, ``new_log_odds``:
+    log-odds, before the votes, of an element that states none and of a found candidate.
     ``correlation_m``: one vote of a line stands for that many metres; ``switch``: cost in log-odds
     of ending or starting a stretch inside a line; ``shortest_m``: shorter stretches are not told;
     ``view_margin_m``: border of the range that does not count as looked at, because detections
@@ -139,6 +140,7 @@ class Policy:
     delete_of: int = 5
     insert_traversals: int = 2
     insert_of: int = 0
+    vanish: float = 0.01
     half_life_days: float = 0.0
     min_probability: float | None = None
     max_false_alarms_per_km: float | None = None
@@ -191,4 +193,5 @@ def prior_log_odds(element: Element, policy: Policy, now_ns: int) -> float:
     if policy.half_life_days > 0 and element.last_seen_ns is not None:
         age = max(now_ns - element.last_seen_ns, 0) / DAY_NS
         odds *= 0.5 ** (age / policy.half_life_days)
-    return odds
+    # However often it was seen, it may have gone since.
+    return float(logit(probability(odds) * (1 - policy.vanish)))

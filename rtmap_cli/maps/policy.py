@@ -11,6 +11,7 @@
     of = 5
 
     [age]
+    vanish = 0.01           # chance that an element has gone since the drives before
     half_life_days = 0      # what a map says about an element fades so fast (0: never)
 
     [tell]
@@ -46,7 +47,10 @@ FIELDS: dict[str, dict[str, tuple[str, type, float, float]]] = {
         "traversals": ("insert_traversals", int, 1, INFINITY),
         "of": ("insert_of", int, 0, INFINITY),
     },
-    "age": {"half_life_days": ("half_life_days", float, 0.0, INFINITY)},
+    "age": {
+        "vanish": ("vanish", float, 0.0, 0.5),
+        "half_life_days": ("half_life_days", float, 0.0, INFINITY),
+    },
     "tell": {
         "min_probability": ("min_probability", float, 0.0, 1.0),
         "max_false_alarms_per_km": ("max_false_alarms_per_km", float, 0.0, INFINITY),
