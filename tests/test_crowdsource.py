@@ -124,6 +124,39 @@ def test_a_new_element_waits_for_a_second_drive_and_comes_by_recursion(
     assert read_map(tmp_path / "map").by_id()["middle"].traversals == 2
 
 
+def test_a_policy_file_says_how_many_drives_must_agree(rtmap: Call, tmp_path: Path) -> None:
+    write_new_map(street(), tmp_path / "map", "prior")
+    _runs(street(crossing("new", 50.0)), tmp_path / "runs", range(2))
+    policy = tmp_path / "policy.toml"
+    policy.write_text("[insert]\ntraversals = 3\n")
+    base = ("crowdsource", tmp_path / "runs", "--map", tmp_path / "map", "--dry-run", "--json")
+    assert json.loads(rtmap(*base).out)["counts"]["inserted"] == 1
+    counts = json.loads(rtmap(*base, "--policy", policy).out)["counts"]
+    assert counts["inserted"] == 0 and counts["waiting"] == 1
+    policy.write_text("[insert]\ntraversal = 3\n")
+    assert "traversal" in rtmap(*base, "--policy", policy, code=3).err
+
+
+def test_a_first_map_may_keep_what_is_improbable_as_such(rtmap: Call, tmp_path: Path) -> None:
+    # The second drive passes and sees no crossing: one against one.
+    _runs(street(crossing("new", 50.0)), tmp_path / "runs", [0])
+    _runs(street(), tmp_path / "runs", [1])
+    policy = tmp_path / "policy.toml"
+    policy.write_text("[insert]\ntraversals = 1\nfirst = 0.0\n")
+    runs, made = tmp_path / "runs", tmp_path / "map"
+    rtmap("crowdsource", runs, "--map", made, "--policy", policy)
+    near = [e for e in read_map(made).of_class("ped_crossing") if abs(_middle(e) - 50.0) < 3]
+    assert len(near) == 1 and near[0].existence < 0
+    policy.write_text("[insert]\ntraversals = 1\nfirst = 0.5\n")
+    rtmap("crowdsource", runs, "--map", tmp_path / "strict", "--policy", policy)
+    strict = read_map(tmp_path / "strict").of_class("ped_crossing")
+    assert not [e for e in strict if abs(_middle(e) - 50.0) < 3]
+
+
+def _middle(element: Any) -> float:
+    return float(element.xy[:-1, 0].mean() - ORIGIN[0])
+
+
 def test_a_deleted_crossing_goes_after_two_drives_in_two_cycles(
     rtmap: Call, tmp_path: Path
 ) -> None:

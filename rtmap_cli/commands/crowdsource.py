@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rtmap_cli.logs.tracks import Track
     from rtmap_cli.logs.traversal import Traversal
     from rtmap_cli.maps.element import Element, VectorMap
+    from rtmap_cli.maps.evidence import Policy
     from rtmap_cli.steps.crowdsource.crowdsource import Workers
     from rtmap_cli.steps.crowdsource.fuse import Fusion
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 @click.option("--dry-run", is_flag=True, help="Tell what would change and write nothing.")
 @click.option("--force", is_flag=True, help="Also fuse runs that the map was fused from already.")
 @click.option("--skip-bad-runs", is_flag=True, help="Leave out unreadable runs and name them.")
+@click.option("--policy", "policy_path", type=options.PATH, help="TOML file: votes and thresholds.")
 @click.option(
     "--without-sigma", is_flag=True, help="Ablation: without U, all detections have the same sigma."
 )
@@ -62,6 +64,7 @@ def command(
     dry_run: bool,
     force: bool,
     skip_bad_runs: bool,
+    policy_path: Path | None,
     without_sigma: bool,
     tile: float,
     jobs: int,
@@ -86,6 +89,7 @@ def command(
     from rtmap_cli.logs.agreement import warning_of
     from rtmap_cli.logs.tracks import read_tracks
     from rtmap_cli.logs.traversal import find_runs
+    from rtmap_cli.maps.policy import read_policy
     from rtmap_cli.maps.store import fused_runs, map_exists, read_map
     from rtmap_cli.output import emit, log
     from rtmap_cli.steps.crowdsource.crowdsource import Task, crowdsource
@@ -105,9 +109,10 @@ def command(
     fresh = [t for t in tracks if t.run_id not in done]
     _tell_unlocalized([t.run_id for t in fresh if not t.localized], exists)
     _tell_mixed(fresh, before.version if before else None)
+    compose = partial(fuse_region, policy=read_policy(policy_path) if policy_path else None)
     fusion, astray = None, {}
     if fresh:
-        found = crowdsource(task, tracks, fuse_region, workers, skip_bad_runs)
+        found = crowdsource(task, tracks, compose, workers, skip_bad_runs)
         fusion, bad = found.fusion, bad + found.bad
         fresh = [t for t in found.tracks if t.run_id not in done]
         if doubt := warning_of(found.agreements, map_path):
@@ -146,23 +151,27 @@ def fuse_region(
     prior: VectorMap,
     classes: Sequence[str],
     fused: Collection[str],
+    policy: Policy | None = None,
 ) -> tuple[Fusion, list[Element]]:
     """Evidence and fusion of one region, and its candidates that wait for another run.
 
     Here the rooms of change detection and of fusion meet; workers call it by its name.
     """
+    from rtmap_cli.maps.evidence import Policy, Settings
     from rtmap_cli.steps.crowdsource.fuse import fuse
     from rtmap_cli.steps.detect_changes.evidence import gather_evidence
 
+    settings = Settings(policy=policy or Policy())
     evidence = []
     if all(set(classes) <= set(t.classes) for t in traversals):
-        evidence = gather_evidence(traversals, prior, classes, fused=fused)
+        evidence = gather_evidence(traversals, prior, classes, settings, fused)
     else:
         # A model that does not know a class has not looked for it.
         for name in classes:
             able = [t for t in traversals if name in t.classes]
-            evidence += gather_evidence(able, prior, [name], fused=fused) if able else []
-    fusion = fuse(prior, evidence, [t for t in traversals if t.run_id not in fused], traversals)
+            evidence += gather_evidence(able, prior, [name], settings, fused) if able else []
+    fresh = [t for t in traversals if t.run_id not in fused]
+    fusion = fuse(prior, evidence, fresh, traversals, settings.policy)
     waiting = set(fusion.waiting)
     return fusion, [e.element for e in evidence if e.new and e.element.element_id in waiting]
 

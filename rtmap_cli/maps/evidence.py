@@ -119,15 +119,18 @@ class Policy:
     """When evidence becomes a change; the defaults suit 2 Hz runs of a car.
 
     ``delete_below``, ``insert_above``: probability of existence below which an element is gone,
-    above which a new one is real. k of n: ``delete_traversals`` of the newest ``delete_of``
-    drives that had an element in view must have missed it (all of them where there are fewer),
+    above which a new one is real; ``first_above`` the same where the map knows nothing yet: what
+    is improbable is kept as such, and goes when further drives do not find it.
+    k of n: ``delete_traversals`` of the newest ``delete_of`` drives that had an element in view
+    must have missed it (all of them where there are fewer),
     ``insert_traversals`` of ``insert_of`` must have found a new one (n = 0: of all drives); where
     only one drive looked at a new element, one is enough only for a first map.
     ``vanish``: chance that an element has gone since the drives before: however sure a map is, it
     can learn; ``half_life_days``: the log-odds of an element halve in so many days after it was
     last seen, before new votes count (0: never). ``min_probability``,
     ``max_false_alarms_per_km``: changes that are told; ``prior_log_odds``, ``new_log_odds``:
-    log-odds, before the votes, of an element that states none and of a found candidate.
+    log-odds, before the votes, of an element that states none and of a found candidate;
+    ``first_log_odds`` the latter where there is no map: roads have lines, new ones are rare.
     ``correlation_m``: one vote of a line stands for that many metres; ``switch``: cost in log-odds
     of ending or starting a stretch inside a line; ``shortest_m``: shorter stretches are not told;
     ``view_margin_m``: border of the range that does not count as looked at, because detections
@@ -136,6 +139,7 @@ class Policy:
 
     delete_below: float = 0.2
     insert_above: float = 0.5
+    first_above: float = 0.08
     delete_traversals: int = 2
     delete_of: int = 5
     insert_traversals: int = 2
@@ -146,6 +150,7 @@ class Policy:
     max_false_alarms_per_km: float | None = None
     prior_log_odds: float = PRIOR_LOG_ODDS
     new_log_odds: float = -1.7
+    first_log_odds: float = -1.0
     correlation_m: float = 8.0
     switch: float = 2.0
     shortest_m: float = 4.0

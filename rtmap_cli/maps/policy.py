@@ -7,6 +7,7 @@
 
     [insert]
     above = 0.5
+    first = 0.08            # the same where the map knows nothing yet
     traversals = 2
     of = 5
 
@@ -44,6 +45,7 @@ FIELDS: dict[str, dict[str, tuple[str, type, float, float]]] = {
     },
     "insert": {
         "above": ("insert_above", float, 0.0, 1.0),
+        "first": ("first_above", float, 0.0, 1.0),
         "traversals": ("insert_traversals", int, 1, INFINITY),
         "of": ("insert_of", int, 0, INFINITY),
     },
@@ -58,6 +60,7 @@ FIELDS: dict[str, dict[str, tuple[str, type, float, float]]] = {
     "evidence": {
         "prior_log_odds": ("prior_log_odds", float, -12.0, 12.0),
         "new_log_odds": ("new_log_odds", float, -12.0, 12.0),
+        "first_log_odds": ("first_log_odds", float, -12.0, 12.0),
         "correlation_m": ("correlation_m", float, 0.5, INFINITY),
         "switch": ("switch", float, 0.0, INFINITY),
         "shortest_m": ("shortest_m", float, 0.0, INFINITY),

@@ -210,9 +210,11 @@ def _updated(element: Element, log_odds: float, counts: Counts) -> Element:
 def _inserted(evidence: Evidence, policy: Policy, charted: _Charted, out: Fusion) -> list[_Piece]:
     stretch, counts = evidence.stretches[0], evidence.counts
     element = evidence.element
-    if float(probability(stretch.log_odds)) < policy.insert_above:
-        return []
     first = not charted.near(element.points)
+    if float(probability(stretch.log_odds)) < (
+        policy.first_above if first else policy.insert_above
+    ):
+        return []
     need = policy.insert_traversals
     if first:
         need = min(need, max(counts.traversals_in_view, 1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,9 @@ def gather_evidence(
     of the prior already: they speak for new candidates only.
     """
     settings = settings or Settings()
+    if not len(prior):
+        first = replace(settings.policy, new_log_odds=settings.policy.first_log_odds)
+        settings = replace(settings, policy=first)
     traversals = sorted(traversals, key=lambda t: t.run_id)
     fresh = np.array([t.run_id not in fused for t in traversals], bool)
     out: list[Evidence] = []
