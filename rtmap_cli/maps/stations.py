@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import arc_length, is_ring
+from rtmap_cli.maps.strands import strands_of
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -66,9 +67,7 @@ class Stations:
     @cached_property
     def strand(self) -> Int:
         """(n,) like ``chain``, but cut where a chain folds back to itself."""
-        from rtmap_cli.maps.strands import strands_of
-
-        return strands_of(self)
+        return strands_of(self.xy, self.tangent, self.s, self.line, self.chain)
 
     def of_line(self, k: int) -> Int:
         """Indices of the stations of line ``k`` in order (they lie together)."""
