@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -133,12 +134,19 @@ def _fuse(
 ) -> Fusion:
     from rtmap_cli.logs.traversal import classes_of
     from rtmap_cli.maps.element import VectorMap
+    from rtmap_cli.maps.refit import FusionModel
+    from rtmap_cli.steps.crowdsource.align.align import align
     from rtmap_cli.steps.crowdsource.fuse import fuse
     from rtmap_cli.steps.detect_changes.evidence import gather_evidence
 
+    model = FusionModel()
+    if before is None:
+        # Nothing says where the runs are but they themselves: first they are put onto each other.
+        fresh = traversals = (aligned := align(traversals)).traversals
+        model = replace(model, common=aligned.common)
     prior = before if before is not None else VectorMap((), crs)
     evidence = gather_evidence(traversals, prior, classes_of(paths), fused=done)
-    return fuse(prior, evidence, fresh, traversals)
+    return fuse(prior, evidence, fresh, traversals, model=model)
 
 
 def _rebuildable(map_path: Path, known: set[str], traversals: list[Traversal]) -> bool:

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.geometry.poses import xyyaw_of
+from rtmap_cli.geometry.poses import wrap_angle, xyyaw_of
+from rtmap_cli.logs.motion import Motion, MotionModel, motion_of
 from rtmap_cli.logs.run import OUTDATED, Run
 
 Array = NDArray[np.float64]
@@ -37,7 +38,8 @@ class Traversal:
     ``score``, ``points`` (n, V, 2) in the map frame and ``covariance`` (n, V, 2, 2) = R Σ Rᵀ of
     the network's own scales (the pose's part is kept apart: it is common to a frame).
     ``asked``: prior elements that the network was asked about, see ``Questions``. ``cut`` (n,):
-    reaches the border of the range; ``localized``: the poses come from localization.
+    reaches the border of the range; ``localized``: the poses come from localization; ``motion``:
+    what GNSS and odometry say of the drive, only where it is not.
     """
 
     run_id: str
@@ -55,6 +57,7 @@ class Traversal:
     asked: Questions
     localized: bool = True
     model_sha256: str | None = None
+    motion: Motion | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -63,6 +66,26 @@ class Traversal:
     def kilometres(self) -> float:
         """Distance driven between its frames."""
         return float(np.hypot(*np.diff(self.pose[:, :2], axis=0).T).sum()) / 1000
+
+    def moved(self, pose: Array, pose_covariance: Array) -> Traversal:
+        """The drive at other poses (m, 3) with other covariances (m, 3, 3), and what it saw."""
+        turn = wrap_angle(pose[:, 2] - self.pose[:, 2])
+        c, s = np.cos(turn), np.sin(turn)
+        rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=-2)
+
+        def put(points: Array, frame: Int) -> Array:
+            local = points - self.pose[frame, None, :2]
+            out: Array = np.einsum("nij,nvj->nvi", rotation[frame], local)
+            return out + pose[frame, None, :2]
+
+        r = rotation[self.frame]
+        return replace(
+            self,
+            pose=pose,
+            pose_covariance=pose_covariance,
+            points=put(self.points, self.frame),
+            covariance=np.einsum("nij,nvjk,nlk->nvil", r, self.covariance, r),
+        )
 
 
 @dataclass(frozen=True)
@@ -181,6 +204,7 @@ def traversal_of(run: Run, min_score: float = FOUND_SCORE) -> Traversal:
         ),
         localized=run.poses is not None,
         model_sha256=run.info.get("model_sha256"),
+        motion=None if run.poses is not None else motion_of(run.frames, pose, MotionModel()),
     )
 
 

@@ -39,7 +39,8 @@ class FusionModel:
     variance that all frames of a drive share (measured where two drives or more overlap);
     ``place_share``: part that every drive shares at a place and that never averages out;
     ``floor``: repeatability, no sigma is below it; ``huber``: offsets beyond that many sigmas
-    lose weight.
+    lose weight; ``common``: variance (m²) per axis of the place that all drives share, where they
+    were aligned to each other and to nothing else.
     """
 
     width: float = 2.0
@@ -47,6 +48,7 @@ class FusionModel:
     place_share: float = 0.1
     floor: float = 0.04
     huber: float = 1.5
+    common: float = 0.0
 
 
 @dataclass(frozen=True)

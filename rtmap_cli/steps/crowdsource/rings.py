@@ -45,7 +45,7 @@ def _combined(
         w = weight * np.minimum(1.0, model.huber / np.maximum(z, 1e-9))
         centre = (means * w[..., None]).sum(0) / w.sum(0)[:, None]
     information = (w / weight / variances[:, None]).sum(axis=0)
-    common = model.place_share * variances.min() + model.floor**2
+    common = model.place_share * variances.min() + model.floor**2 + model.common
     return centre, 1.0 / information + common
 
 
