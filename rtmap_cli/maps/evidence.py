@@ -80,7 +80,8 @@ class Policy:
     """When evidence becomes a change; the defaults suit 2 Hz runs of a car.
 
     ``delete_below``, ``insert_above``: probability of existence below which an element is gone,
-    above which a new one is real. ``delete_traversals``, ``insert_traversals``: drives that must
+    above which a new one is real; ``first_above`` the same where there is no map yet: what is
+    improbable is kept as such, and goes when further drives do not find it. ``delete_traversals``, ``insert_traversals``: drives that must
     have looked at (seen) it; where only one drive looked at a new element, one is enough only
     for a first map. ``new_log_odds``: log-odds that a found candidate is real before the votes.
     ``correlation_m``: one vote of a line stands for that many metres; ``switch``: cost in log-odds
@@ -91,6 +92,7 @@ class Policy:
 
     delete_below: float = 0.2
     insert_above: float = 0.5
+    first_above: float = 0.1
     delete_traversals: int = 2
     insert_traversals: int = 2
     new_log_odds: float = -1.0

@@ -197,12 +197,13 @@ def _updated(element: Element, ratio: float, counts: Counts) -> Element:
 def _inserted(evidence: Evidence, policy: Policy, charted: _Charted, out: Fusion) -> list[_Piece]:
     stretch, counts = evidence.stretches[0], evidence.counts
     element = evidence.element
-    if float(probability(stretch.log_odds)) < policy.insert_above:
-        return []
     first = not charted.near(element.points)
-    need = policy.insert_traversals
+    least, need = policy.insert_above, policy.insert_traversals
     if first:
-        need = min(need, max(counts.traversals_in_view, 1))
+        least = policy.first_above
+        need = 0
+    if float(probability(stretch.log_odds)) < least:
+        return []
     if counts.traversals_seen < need:
         out.waiting.append(element.element_id)
         return []
