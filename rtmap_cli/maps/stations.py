@@ -26,6 +26,8 @@ GATE = 1.5
 """A detection farther than this (m) from a line does not belong to it."""
 MIN_COS = 0.80
 """Least cosine between the directions of a detection and a line (about 37°)."""
+CELL = 3.0
+"""Two detections of a frame that meet a line within such a stretch (m) of it lie side by side."""
 MIN_STRETCH = 3.0
 """Shortest part of a detection (m) that can be assigned to a line on its own."""
 
@@ -253,23 +255,29 @@ def candidate_feet(
 
 
 def assign(
-    stations: Stations, samples: Samples, gate: float = GATE, rounds: int = 3
+    stations: Stations,
+    samples: Samples,
+    gate: float = GATE,
+    rounds: int = 3,
+    exclusive: bool = True,
 ) -> tuple[Feet, NDArray[np.bool_]]:
     """Assign each stretch of every detection to one chain, and say which samples found one.
 
     A detection goes to the chain of lowest mean truncated offset, Σ spacing · (gate − |offset|);
     what that chain does not cover goes to the next one, for ``rounds`` rounds: a detection may
-    run over several lines but no sample counts twice. The last answer is remembered.
+    run over several lines but no sample counts twice. ``exclusive``: two detections of one frame
+    side by side are two lines, never one. The last answer is remembered.
     """
-    if samples.last and samples.last[0][0] is stations and samples.last[0][1:] == (gate, rounds):
+    asked = (gate, rounds, exclusive)
+    if samples.last and samples.last[0][0] is stations and samples.last[0][1:] == asked:
         return samples.last[1]
-    found = _assigned(stations, samples, gate, rounds)
-    samples.last[:] = [(stations, gate, rounds), found]
+    found = _assigned(stations, samples, gate, rounds, exclusive)
+    samples.last[:] = [(stations, *asked), found]
     return found
 
 
 def _assigned(
-    stations: Stations, samples: Samples, gate: float, rounds: int
+    stations: Stations, samples: Samples, gate: float, rounds: int, exclusive: bool
 ) -> tuple[Feet, NDArray[np.bool_]]:
     taken = np.zeros(len(samples), bool)
     nothing = Feet(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
@@ -286,25 +294,95 @@ def _assigned(
     total = np.bincount(samples.detection, samples.spacing)
     least = np.minimum(MIN_STRETCH, 0.6 * total[owner])
     parts: list[Int] = []
+    used = _Used(stations, samples) if exclusive else None
+    open_ = np.ones(len(i), bool)
     for _ in range(rounds):
-        free = np.flatnonzero(~taken[i])
+        free = np.flatnonzero(open_ & ~taken[i])
         if not len(free):
             break
         gain = np.bincount(inverse[free], value[free], len(keys))
         cover = np.bincount(inverse[free], spacing[free], len(keys))
         enough = (cover >= least) & (cover > 0)
-        order = np.lexsort((keys, -np.where(enough, gain, -1.0), owner))
-        best = np.zeros(len(keys), bool)
-        best[order] = np.concatenate([[True], owner[order][1:] != owner[order][:-1]])
+        gain = np.where(enough, gain, -1.0)
+        best = _best(keys, owner, gain)
+        if used is not None:
+            best = used.contested(best, owner, gain, i[free], j[free], inverse[free])
         index = free[(best & enough)[inverse[free]]]
         if not len(index):
             break
         parts.append(index)
         taken[i[index]] = True
+        if used is not None:
+            used.mark(i[index], j[index])
+            open_ &= ~used.by_others(i, j)
     if not parts:
         return nothing, taken
     k = np.concatenate(parts)
     return Feet(i[k], j[k], offset[k], along[k]), taken
+
+
+def _best(keys: Int, owner: Int, gain: Array) -> NDArray[np.bool_]:
+    """Which of the (detection, chain) ``keys`` has the highest gain of its detection ``owner``."""
+    order = np.lexsort((keys, -gain, owner))
+    best = np.zeros(len(keys), bool)
+    best[order] = np.concatenate([[True], owner[order][1:] != owner[order][:-1]])
+    return best
+
+
+class _Used:
+    """Cells (frame, line, a few metres) that detections have taken."""
+
+    def __init__(self, stations: Stations, samples: Samples) -> None:
+        place = np.floor(stations.s / CELL).astype(np.int64)
+        change = np.ones(len(stations), bool)
+        change[1:] = (np.diff(stations.line) != 0) | (np.diff(place) != 0)
+        self.place = np.cumsum(change) - 1
+        self.places = int(self.place[-1]) + 1
+        self.samples = samples
+        self.cells = np.zeros(0, np.int64)
+        self.owner = np.zeros(0, np.int64)
+
+    def cell(self, sample: Int, station: Int) -> Int:
+        """Number of the cell of a sample with its foot at a station."""
+        return np.asarray(self.samples.frame[sample] * self.places + self.place[station])
+
+    def contested(
+        self, best: NDArray[np.bool_], owner: Int, gain: Array, sample: Int, station: Int, row: Int
+    ) -> NDArray[np.bool_]:
+        """``best`` less those that lose most of their cells to a detection with more to lose.
+
+        A detection loses the difference between its best and its second chain; of two detections
+        and two lines the better one of both ways to pair them comes out.
+        """
+        second = np.where(best, -np.inf, gain)
+        other = np.full(int(owner.max()) + 1, 0.0)
+        np.maximum.at(other, owner, second)
+        regret = np.where(best, gain - other[owner], -np.inf)
+        mine = np.flatnonzero(best[row])
+        cells = self.cell(sample[mine], station[mine])
+        r = row[mine]
+        _, place = np.unique(cells, return_inverse=True)
+        order = np.lexsort((-r, regret[r], place))
+        top = np.full(int(place.max(initial=-1)) + 1, -1)
+        # The last one written is the one with the highest regret.
+        top[place[order]] = r[order]
+        lost = np.bincount(r, top[place] != r, len(best))
+        return best & (lost <= 0.5 * np.bincount(r, minlength=len(best)))
+
+    def mark(self, sample: Int, station: Int) -> None:
+        """Take the cells of these feet."""
+        cells, first = np.unique(self.cell(sample, station), return_index=True)
+        cells = np.concatenate([self.cells, cells])
+        owner = np.concatenate([self.owner, self.samples.detection[sample[first]]])
+        self.cells, first = np.unique(cells, return_index=True)
+        self.owner = owner[first]
+
+    def by_others(self, sample: Int, station: Int) -> NDArray[np.bool_]:
+        """(k,) True where another detection of the frame has the cell of a foot."""
+        cell = self.cell(sample, station)
+        at = np.minimum(np.searchsorted(self.cells, cell), len(self.cells) - 1)
+        taken = self.cells[at] == cell
+        return np.asarray(taken & (self.owner[at] != self.samples.detection[sample]))
 
 
 def loose_stretches(samples: Samples, taken: NDArray[np.bool_], shortest: float) -> Int:

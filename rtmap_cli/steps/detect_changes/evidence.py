@@ -21,6 +21,7 @@ from rtmap_cli.maps.existence import (
 )
 from rtmap_cli.maps.stations import GATE, MIN_COS, Samples, Stations, stations_of
 from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, ring_counts
+from rtmap_cli.steps.detect_changes.doubles import split_doubles
 from rtmap_cli.steps.detect_changes.lines import (
     all_line_counts,
     class_samples,
@@ -85,6 +86,8 @@ def _lines(
     samples = [class_samples(t, name) for t in traversals]
     old = [e.xy for e in prior]
     found = new_lines(name, stations_of(old), traversals, samples)
+    found = refit_lines(found, old, traversals, samples, settings.fusion)
+    found = split_doubles(found, samples)
     for _ in range(2):
         found = refit_lines(found, old, traversals, samples, settings.fusion)
     for last in (False, True):
