@@ -14,6 +14,7 @@ from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
 from rtmap_cli.maps.evidence import Counts, Evidence, Policy, Stretch
 from rtmap_cli.maps.existence import LIMIT, PRIOR_LOG_ODDS, probability
 from rtmap_cli.maps.refit import FusionModel
+from rtmap_cli.steps.crowdsource.forks import OUTLINES, Branch, forked
 from rtmap_cli.steps.crowdsource.lines import fuse_lines, snap_ends
 from rtmap_cli.steps.crowdsource.rings import fuse_ring
 
@@ -231,19 +232,21 @@ def _geometry(
     model: FusionModel,
     out: Fusion,
 ) -> list[Element]:
-    done: dict[int, Element] = {}
+    done: dict[int, list[Element]] = {}
     for name in dict.fromkeys(p.element.class_name for p in pieces):
         index = [k for k, p in enumerate(pieces) if p.element.class_name == name]
         if name in RING_CLASSES:
             for k in index:
-                done[k] = _fused_ring(pieces[k], name, fresh, every, model, out)
+                done[k] = [_fused_ring(pieces[k], name, fresh, every, model, out)]
             continue
         group = [pieces[k] for k in index]
-        for k, element in zip(
-            index, _fused_lines(group, name, fresh, every, model, out), strict=True
-        ):
-            done[k] = element
-    return [done[k] for k in sorted(done)]
+        fused = _fused_lines(group, name, fresh, every, model, out)
+        if name not in OUTLINES:
+            fused = _at_forks(fused, [p.new for p in group], out)
+        else:
+            fused = [[e] for e in fused]
+        done |= dict(zip(index, fused, strict=True))
+    return [element for k in sorted(done) for element in done[k]]
 
 
 def _fused_lines(
@@ -280,6 +283,27 @@ def _fused_lines(
             )
         )
     return elements
+
+
+def _at_forks(elements: list[Element], new: list[bool], out: Fusion) -> list[list[Element]]:
+    """New lines cut where others end on them; the longest part keeps the id."""
+    lines = [Branch(e.points, e.covariance, k) for k, e in enumerate(elements)]
+    parts: list[list[Branch]] = [[] for _ in elements]
+    for branch in forked(lines, new):
+        parts[branch.source].append(branch)
+    result = []
+    for element, own in zip(elements, parts, strict=True):
+        order = sorted(range(len(own)), key=lambda k: (-length(own[k].points), k))
+        names = {k: f"{element.element_id}.{r}" if r else element.element_id
+                 for r, k in enumerate(order)}  # fmt: skip
+        out.inserted += [n for n in names.values() if n != element.element_id]
+        result.append(
+            [
+                replace(element, element_id=names[k], points=b.points, covariance=b.covariance)
+                for k, b in enumerate(own)
+            ]
+        )
+    return result
 
 
 def _thinned(points: Array, covariance: Array | None) -> tuple[Array, Array | None]:
