@@ -15,15 +15,15 @@ Array = NDArray[np.float64]
 OUTLINES = ("boundary",)
 """Classes whose lines are outlines of areas: they never fork."""
 BESIDE = 1.2
-"""An end so near (m) to the inside of a line, and running into it, is a fork …"""
+"""An end so near (m) to the inside of a line is a fork …"""
 AHEAD = 10.0
-"""… when it meets that line within this distance (m) …"""
-ANGLE = float(np.radians(35))
-"""… at no more than this angle."""
+"""… when it goes on to meet that line within this distance (m) …"""
+NEARS = 0.4
+"""… and comes nearer by this (m) at least …"""
+BASE = 10.0
+"""… over its last metres."""
 FROM_END = 3.0
 """Nearer (m) to the end of a line there is no fork: ends meet there."""
-BASE = 5.0
-"""The direction of an end is that of its last metres (m)."""
 
 
 @dataclass
@@ -60,53 +60,52 @@ def _node(
     points: Array, side: int, lines: list[list[Branch]], may: Sequence[bool], own: int
 ) -> tuple[int, int, float] | None:
     """Line, its part and arc length (m) at which an end runs into another line, if it does."""
-    end, outward = points[side, :2], _outward(points, side)
+    end, before = points[side, :2], _before(points, side)
     best: tuple[float, int, int, float] | None = None
     for j, parts in enumerate(lines):
         if j == own or not may[j]:
             continue
         for part, branch in enumerate(parts):
-            found = _meeting(end, outward, branch.points)
+            found = _meeting(end, before, branch.points)
             if found is not None and (best is None or found[0] < best[0]):
                 best = (found[0], j, part, found[1])
     return None if best is None else best[1:]
 
 
-def _outward(points: Array, side: int) -> Array:
+def _before(points: Array, side: int) -> Array:
+    """The point ``BASE`` metres before an end, or the other end of a shorter line."""
     p = points[:, :2] if side else points[::-1, :2]
     at = arc_length(p)
-    start = np.array([np.interp(max(at[-1] - BASE, 0.0), at, p[:, i]) for i in (0, 1)])
-    d = p[-1] - start
-    return np.asarray(d / max(float(np.hypot(*d)), 1e-9))
+    return np.array([np.interp(max(at[-1] - BASE, 0.0), at, p[:, i]) for i in (0, 1)])
 
 
-def _meeting(end: Array, outward: Array, line: Array) -> tuple[float, float] | None:
-    """Distance of an end to a line, and where on the line (arc length, m) it runs into it."""
+def _meeting(end: Array, before: Array, line: Array) -> tuple[float, float] | None:
+    """Distance of an end to a line, and where on the line (arc length, m) it runs into it.
+
+    ``before`` is a point of the ending line some metres back: it must lie on the same side and
+    clearly farther away.
+    """
     low, high = line[:, :2].min(axis=0) - BESIDE, line[:, :2].max(axis=0) + BESIDE
     if (end < low).any() or (end > high).any():
         return None
-    foot, distance, segment = project(end[None], line)
-    if distance[0] > BESIDE:
+    feet, distance, segment = project(np.stack([end, before]), line)
+    if distance[0] > BESIDE or distance[1] < distance[0] + NEARS:
         return None
     at = arc_length(line)
-    s = float(at[segment[0]] + np.hypot(*(foot[0] - line[segment[0], :2])))
-    d = line[segment[0] + 1, :2] - line[segment[0], :2]
-    d = d / max(float(np.hypot(*d)), 1e-9)
-    along = float(outward @ d)
-    if abs(along) < np.cos(ANGLE):
+    s = at[segment] + np.hypot(*(feet - line[segment, :2]).T)
+    along = float(s[0] - s[1])
+    if abs(along) < 0.8 * float(np.hypot(*(end - before))):
         return None
-    # How fast the end nears the line, per metre along it.
-    across = float(outward @ (foot[0] - end)) / max(float(distance[0]), 1e-9)
-    if distance[0] > 0.05:
-        if across <= 0.01:
-            return None
-        ahead = float(distance[0]) * abs(along) / across
-        if ahead > AHEAD:
-            return None
-        s += np.sign(along) * ahead
-    if not FROM_END <= s <= at[-1] - FROM_END:
+    sides = ((np.stack([end, before]) - feet) * (before - feet[1])).sum(axis=1)
+    # Past the line already, or on its way to it.
+    nears = float(distance[1] - distance[0] if sides[0] > 0 else distance[1] + distance[0])
+    ahead = float(distance[0]) * along / nears if sides[0] > 0 else 0.0
+    if abs(ahead) > AHEAD:
         return None
-    return float(distance[0]), s
+    place = float(s[0]) + ahead
+    if not FROM_END <= place <= at[-1] - FROM_END:
+        return None
+    return float(distance[0]), place
 
 
 def _cut(branch: Branch, at: float) -> tuple[Branch, Branch]:

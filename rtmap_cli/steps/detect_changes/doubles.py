@@ -20,8 +20,9 @@ from rtmap_cli.maps.stations import CELL, Samples, Stations, assign, stations_of
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-OFTEN = 0.12
-"""Share of the frames with any detection that must hold two: a false one is rarer."""
+OFTEN, STILL = 0.12, 0.05
+"""Share of the frames with any detection that must hold two somewhere in a stretch, and all along
+it: a false one is rarer."""
 WIDTH = 6.0
 """Sigma (m) of the smoothing along the line."""
 SHORTEST = 7.0
@@ -56,11 +57,9 @@ def split_doubles(lines: list[Array], samples: Sequence[Samples]) -> list[Array]
     place, first = _places(stations)
     beside = _smoothed(_counted(stations, place, samples), stations, place, first)
     need = 2 if sum(len(s) > 0 for s in samples) > 1 else 1
-    double = (
-        (beside.pairs > OFTEN * beside.frames)
-        & (beside.drives >= 0.5 * need)
-        & (beside.high - beside.low > NARROWEST)
-    )
+    apart = (beside.drives >= 0.5 * need) & (beside.high - beside.low > NARROWEST)
+    sure = apart & (beside.pairs > OFTEN * beside.frames)
+    double = apart & (beside.pairs > STILL * beside.frames)
     out: list[Array] = []
     for k, line in enumerate(lines):
         index = stations.of_line(k)
@@ -69,6 +68,7 @@ def split_doubles(lines: list[Array], samples: Sequence[Samples]) -> list[Array]
             run
             for run in runs_of(_to_the_ends(flags, stations.s[index]))
             if stations.s[index[run[-1]]] - stations.s[index[run[0]]] >= SHORTEST
+            and sure[place[index[run]]].any()
         ]
         if not runs or is_ring(line):
             out.append(line)
