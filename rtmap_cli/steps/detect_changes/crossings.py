@@ -26,6 +26,10 @@ Int = NDArray[np.int64]
 
 NEAR = 3.5
 """Rings whose features (centre, direction) differ by more than this (m) are different ones."""
+REACH, FARTHEST = 2.2, 8.0
+"""… or than this many sigmas of a detection, which are up to so far (m)."""
+CUT_SHARE = 0.3
+"""What a detection that the range cuts counts, against a whole one, where a ring lies."""
 VISIBLE = 0.65
 """A ring is in view of a frame when this share of its outline and middle is."""
 INSIDE = 0.6
@@ -81,7 +85,12 @@ def class_rings(traversal: Traversal, class_name: str) -> Rings:
     )
 
 
-def match(rings: Rings, places: Array, near: float = NEAR) -> Int:
+def _near(variance: Array) -> Array:
+    """(n,) farthest features of the ring that detections of a variance (m²) may belong to."""
+    return np.clip(REACH * np.sqrt(variance), NEAR, FARTHEST)
+
+
+def match(rings: Rings, places: Array) -> Int:
     """(n,) index of the place (m, 80, 2) that each detection belongs to, or -1.
 
     The nearest in the feature space; a detection cut by the range may also overlap the place
@@ -94,7 +103,8 @@ def match(rings: Rings, places: Array, near: float = NEAR) -> Int:
     if not len(places) or not len(rings):
         return out
     distance, nearest = cKDTree(features(places)).query(rings.feature)
-    out[distance <= near] = nearest[distance <= near]
+    near = distance <= _near(rings.variance)
+    out[near] = nearest[near]
     left = np.flatnonzero(out < 0)
     if not len(left):
         return out
@@ -127,20 +137,21 @@ def new_rings(prior: Array, drives: Sequence[Rings], least: float = 0.8) -> Arra
     found = prior[:0]
     for cut in (False, True):
         known = np.concatenate([prior, found])
-        keep = [(match(r, known) < 0) & (r.cut == cut) for r in drives]
+        keep = [(match(r, known) < 0) & (r.cut | (not cut)) for r in drives]
         parts = [
-            (r.points[k], r.feature[k], r.score[k], r.variance[k])
+            (r.points[k], r.feature[k], r.score[k] * np.where(r.cut[k] & (not cut), CUT_SHARE, 1.0),
+             r.variance[k])
             for r, k in zip(drives, keep, strict=True)
-        ]
+        ]  # fmt: skip
         points, feature, score, variance = (np.concatenate(p) for p in zip(*parts, strict=True))
         if len(points):
-            weight = score / np.maximum(variance, 0.01) ** SHARPNESS
-            found = np.concatenate([found, _means(points, feature, score, weight, least)])
+            found = np.concatenate([found, _means(points, feature, score, variance, least)])
     return found
 
 
-def _means(points: Array, feature: Array, score: Array, weight: Array, least: float) -> Array:
+def _means(points: Array, feature: Array, score: Array, variance: Array, least: float) -> Array:
     """Mean rings of the clusters, twice reassigned to the nearest one."""
+    weight, near = score / np.maximum(variance, 0.01) ** SHARPNESS, _near(variance)
     groups = _clusters(feature, score, least)
     means = points[:0]
     for k in range(3):
@@ -151,7 +162,7 @@ def _means(points: Array, feature: Array, score: Array, weight: Array, least: fl
             break
         means = _apart(means)
         distance, owner = _nearest(features(means), feature)
-        groups = [np.flatnonzero((owner == i) & (distance <= NEAR)) for i in range(len(means))]
+        groups = [np.flatnonzero((owner == i) & (distance <= near)) for i in range(len(means))]
         groups = [g for g in groups if len(g) and score[g].sum() >= least]
     return means
 
