@@ -92,7 +92,7 @@ class Policy:
 
     delete_below: float = 0.2
     insert_above: float = 0.5
-    first_above: float = 0.1
+    first_above: float = 0.04
     delete_traversals: int = 2
     insert_traversals: int = 2
     new_log_odds: float = -1.0
