@@ -81,13 +81,13 @@ class Policy:
 
     ``delete_below``, ``insert_above``: probability of existence below which an element is gone,
     above which a new one is real; ``first_above`` the same where there is no map yet: what is
-    improbable is kept as such, and goes when further drives do not find it. ``delete_traversals``, ``insert_traversals``: drives that must
-    have looked at (seen) it; where only one drive looked at a new element, one is enough only
-    for a first map. ``new_log_odds``: log-odds that a found candidate is real before the votes.
-    ``correlation_m``: one vote of a line stands for that many metres; ``switch``: cost in log-odds
-    of ending or starting a stretch inside a line; ``shortest_m``: shorter stretches are not told;
-    ``view_margin_m``: border of the range that does not count as looked at, because detections
-    are cut short there.
+    improbable is kept as such, and goes when further drives do not find it. ``delete_traversals``,
+    ``insert_traversals``: drives that must have looked at (seen) it; where only one drive looked at
+    a new element, one is enough only for a first map. ``new_log_odds``: log-odds that a found
+    candidate is real before the votes. ``correlation_m``: one vote of a line stands for that many
+    metres; ``switch``: cost in log-odds of ending or starting a stretch inside a line;
+    ``shortest_m``: shorter stretches are not told; ``view_margin_m``: border of the range that does
+    not count as looked at, because detections are cut short there.
     """
 
     delete_below: float = 0.2

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import arc_length, is_ring
+from rtmap_cli.maps.exclusive import Taken
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -26,8 +27,6 @@ GATE = 1.5
 """A detection farther than this (m) from a line does not belong to it."""
 MIN_COS = 0.80
 """Least cosine between the directions of a detection and a line (about 37°)."""
-CELL = 3.0
-"""Two detections of a frame that meet a line within such a stretch (m) of it lie side by side."""
 MIN_STRETCH = 3.0
 """Shortest part of a detection (m) that can be assigned to a line on its own."""
 
@@ -294,13 +293,13 @@ def _assigned(
     total = np.bincount(samples.detection, samples.spacing)
     least = np.minimum(MIN_STRETCH, 0.6 * total[owner])
     parts: list[Int] = []
-    used = _Used(stations, samples) if exclusive else None
+    used = Taken(stations, samples) if exclusive else None
     open_ = np.ones(len(i), bool)
     for _ in range(rounds):
         free = np.flatnonzero(open_ & ~taken[i])
         if not len(free):
             break
-        gain = np.bincount(inverse[free], value[free], len(keys))
+        gain = np.bincount(inverse[free], value[free], len(keys)).astype(np.float64)
         cover = np.bincount(inverse[free], spacing[free], len(keys))
         enough = (cover >= least) & (cover > 0)
         gain = np.where(enough, gain, -1.0)
@@ -327,62 +326,6 @@ def _best(keys: Int, owner: Int, gain: Array) -> NDArray[np.bool_]:
     best = np.zeros(len(keys), bool)
     best[order] = np.concatenate([[True], owner[order][1:] != owner[order][:-1]])
     return best
-
-
-class _Used:
-    """Cells (frame, line, a few metres) that detections have taken."""
-
-    def __init__(self, stations: Stations, samples: Samples) -> None:
-        place = np.floor(stations.s / CELL).astype(np.int64)
-        change = np.ones(len(stations), bool)
-        change[1:] = (np.diff(stations.line) != 0) | (np.diff(place) != 0)
-        self.place = np.cumsum(change) - 1
-        self.places = int(self.place[-1]) + 1
-        self.samples = samples
-        self.cells = np.zeros(0, np.int64)
-        self.owner = np.zeros(0, np.int64)
-
-    def cell(self, sample: Int, station: Int) -> Int:
-        """Number of the cell of a sample with its foot at a station."""
-        return np.asarray(self.samples.frame[sample] * self.places + self.place[station])
-
-    def contested(
-        self, best: NDArray[np.bool_], owner: Int, gain: Array, sample: Int, station: Int, row: Int
-    ) -> NDArray[np.bool_]:
-        """``best`` less those that lose most of their cells to a detection with more to lose.
-
-        A detection loses the difference between its best and its second chain; of two detections
-        and two lines the better one of both ways to pair them comes out.
-        """
-        second = np.where(best, -np.inf, gain)
-        other = np.full(int(owner.max()) + 1, 0.0)
-        np.maximum.at(other, owner, second)
-        regret = np.where(best, gain - other[owner], -np.inf)
-        mine = np.flatnonzero(best[row])
-        cells = self.cell(sample[mine], station[mine])
-        r = row[mine]
-        _, place = np.unique(cells, return_inverse=True)
-        order = np.lexsort((-r, regret[r], place))
-        top = np.full(int(place.max(initial=-1)) + 1, -1)
-        # The last one written is the one with the highest regret.
-        top[place[order]] = r[order]
-        lost = np.bincount(r, top[place] != r, len(best))
-        return best & (lost <= 0.5 * np.bincount(r, minlength=len(best)))
-
-    def mark(self, sample: Int, station: Int) -> None:
-        """Take the cells of these feet."""
-        cells, first = np.unique(self.cell(sample, station), return_index=True)
-        cells = np.concatenate([self.cells, cells])
-        owner = np.concatenate([self.owner, self.samples.detection[sample[first]]])
-        self.cells, first = np.unique(cells, return_index=True)
-        self.owner = owner[first]
-
-    def by_others(self, sample: Int, station: Int) -> NDArray[np.bool_]:
-        """(k,) True where another detection of the frame has the cell of a foot."""
-        cell = self.cell(sample, station)
-        at = np.minimum(np.searchsorted(self.cells, cell), len(self.cells) - 1)
-        taken = self.cells[at] == cell
-        return np.asarray(taken & (self.owner[at] != self.samples.detection[sample]))
 
 
 def loose_stretches(samples: Samples, taken: NDArray[np.bool_], shortest: float) -> Int:

@@ -241,11 +241,10 @@ def _geometry(
             continue
         group = [pieces[k] for k in index]
         fused = _fused_lines(group, name, fresh, every, model, out)
+        parts = [[e] for e in fused]
         if name not in OUTLINES:
-            fused = _at_forks(fused, [p.new for p in group], out)
-        else:
-            fused = [[e] for e in fused]
-        done |= dict(zip(index, fused, strict=True))
+            parts = _at_forks(fused, [p.new for p in group], out)
+        done |= dict(zip(index, parts, strict=True))
     return [element for k in sorted(done) for element in done[k]]
 
 

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import is_ring
+from rtmap_cli.maps.exclusive import CELL, cells_of
 from rtmap_cli.maps.existence import runs_of
-from rtmap_cli.maps.stations import CELL, Samples, Stations, assign, stations_of
+from rtmap_cli.maps.stations import Samples, Stations, assign, stations_of
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -45,16 +46,20 @@ class _Beside:
     high: Array
 
 
-def split_doubles(lines: list[Array], samples: Sequence[Samples]) -> list[Array]:
-    """The lines, with a second one where the detections of single frames show two.
+def split_doubles(
+    lines: list[Array], others: list[Array], samples: Sequence[Samples]
+) -> list[Array]:
+    """The lines, with a second one where the detections of single frames show two; ``others`` are
+    known and compete for detections.
 
     Of two lines the one that goes on most smoothly continues the old one, the other one starts
     where they part.
     """
     if not lines:
         return []
-    stations = stations_of(lines)
-    place, first = _places(stations)
+    stations = stations_of([*others, *lines])
+    place = cells_of(stations)
+    first = np.searchsorted(place, np.arange(int(place[-1]) + 1))
     beside = _smoothed(_counted(stations, place, samples), stations, place, first)
     need = 2 if sum(len(s) > 0 for s in samples) > 1 else 1
     apart = (beside.drives >= 0.5 * need) & (beside.high - beside.low > NARROWEST)
@@ -62,7 +67,7 @@ def split_doubles(lines: list[Array], samples: Sequence[Samples]) -> list[Array]
     double = apart & (beside.pairs > STILL * beside.frames)
     out: list[Array] = []
     for k, line in enumerate(lines):
-        index = stations.of_line(k)
+        index = stations.of_line(len(others) + k)
         flags = double[place[index]]
         runs = [
             run
@@ -79,14 +84,6 @@ def split_doubles(lines: list[Array], samples: Sequence[Samples]) -> list[Array]
         sides = [np.interp(s, middle[own], v[own]) for v in (beside.low, beside.high)]
         out += _parted(stations.xy[index], stations.normal[index], runs, sides)
     return out
-
-
-def _places(stations: Stations) -> tuple[Int, Int]:
-    """Number of the place (``CELL`` metres of a line) of each station, and its first station."""
-    along = np.floor(stations.s / CELL).astype(np.int64)
-    change = np.ones(len(stations), bool)
-    change[1:] = (np.diff(stations.line) != 0) | (np.diff(along) != 0)
-    return np.cumsum(change) - 1, np.flatnonzero(change)
 
 
 def _last(first: Int, count: int) -> Int:
@@ -114,13 +111,11 @@ def _counted(stations: Stations, place: Int, samples: Sequence[Samples]) -> _Bes
         where = cells[start] % n
         pair = end > start
         found = np.bincount(where[pair], minlength=n)
-        total += [
-            np.bincount(where, minlength=n),
-            found,
-            found > 0,
-            np.bincount(where[pair], offset[start[pair]], n),
-            np.bincount(where[pair], offset[end[pair]], n),
-        ]
+        total[0] += np.bincount(where, minlength=n)
+        total[1] += found
+        total[2] += found > 0
+        total[3] += np.bincount(where[pair], offset[start[pair]], n)
+        total[4] += np.bincount(where[pair], offset[end[pair]], n)
     return _Beside(*total)
 
 

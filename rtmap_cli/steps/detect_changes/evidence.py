@@ -87,7 +87,7 @@ def _lines(
     old = [e.xy for e in prior]
     found = new_lines(name, stations_of(old), traversals, samples)
     found = refit_lines(found, old, traversals, samples, settings.fusion)
-    found = split_doubles(found, samples)
+    found = split_doubles(found, old, samples)
     for _ in range(2):
         found = refit_lines(found, old, traversals, samples, settings.fusion)
     for last in (False, True):

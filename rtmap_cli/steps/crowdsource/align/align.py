@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,7 @@ def align(traversals: Sequence[Traversal]) -> Aligned:
     slow = np.concatenate([m.slow for m in motions])
     cloud = cloud_of(free, first)
     if len(cloud) and len(free) > 1:
-        spans = [slice(int(a), int(b)) for a, b in zip(first[:-1], first[1:], strict=True)]
+        spans = [slice(a, b) for a, b in pairwise(first.tolist())]
         stretch = stretches_of(pose, first)
         for blur in COARSE:
             surface = surfaces(cloud, pose, stretch, blur)
@@ -110,9 +111,7 @@ def _shifted(surface: Array, stretch: Int, motion: Motion, pose: Array) -> Array
     numbers = np.unique(stretch)
     travel = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T))])
     middle = np.array([travel[stretch == k].mean() for k in numbers])
-    before = np.array(
-        [(pose - motion.gnss)[stretch == k, :2].mean(axis=0) for k in numbers]
-    )
+    before = np.array([(pose - motion.gnss)[stretch == k, :2].mean(axis=0) for k in numbers])
     shift = best_shifts(surface[numbers], motion.slow[0, :2], before)
     return np.stack([np.interp(travel, middle, shift[:, i]) for i in (0, 1)], axis=-1)
 
@@ -134,9 +133,10 @@ def _to_common(pose: Array, gnss: Array, slow: Array) -> Array:
     )
     kernel = np.exp(-0.5 * (near.data / COMMON) ** 2)
     n = len(nodes)
-    mean = np.stack(
-        [np.bincount(near.row, kernel * off[near.col, i], n) for i in (0, 1)], axis=-1
-    ) / np.bincount(near.row, kernel * total[near.col], n)[:, None]
+    mean = (
+        np.stack([np.bincount(near.row, kernel * off[near.col, i], n) for i in (0, 1)], axis=-1)
+        / np.bincount(near.row, kernel * total[near.col], n)[:, None]
+    )
     # Between nodes the mean varies smoothly: the kernel again, at the frames.
     d = cKDTree(pose[:, :2]).sparse_distance_matrix(
         cKDTree(places), 2.5 * NODE, output_type="coo_matrix"

@@ -7,6 +7,8 @@ the prior and slow changes from stretch to stretch.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,10 +34,10 @@ def stretches_of(pose: Array, first: Int) -> Int:
     """(F,) number of the stretch of every frame, over all drives."""
     out = np.zeros(len(pose), np.int64)
     count = 0
-    for a, b in zip(first[:-1], first[1:], strict=True):
+    for a, b in pairwise(first.tolist()):
         step = np.hypot(*np.diff(pose[a:b, :2], axis=0).T)
         travel = np.concatenate([[0.0], np.cumsum(step)])
-        parts = max(1, int(round(travel[-1] / STRETCH)))
+        parts = max(1, round(float(travel[-1]) / STRETCH))
         own = np.minimum((travel / max(travel[-1], 1e-9) * parts).astype(np.int64), parts - 1)
         out[a:b] = own + count
         count += parts
