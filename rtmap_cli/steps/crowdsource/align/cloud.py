@@ -67,14 +67,15 @@ def cloud_of(traversals: Sequence[Traversal], first: Int) -> Cloud:
         variance = np.einsum("ni,nij,nj->n", normal, s.covariance, normal)
         variance = np.maximum(variance, 0.01)
         step = np.hypot(*np.diff(t.pose[:, :2], axis=0, append=t.pose[-1:, :2]).T)
-        kind = np.searchsorted(names, t.class_name[index].astype(str))[s.detection]
+        each = 2 * t.points.shape[1] - 1
+        kind = np.repeat(np.searchsorted(names, t.class_name[index].astype(str)), each)
         c, n, d = np.cos(p[:, 2]), np.sin(p[:, 2]), s.xy - p[:, :2]
         local = np.stack([c * d[:, 0] + n * d[:, 1], c * d[:, 1] - n * d[:, 0]], axis=-1)
         angle = np.arctan2(s.tangent[:, 1], s.tangent[:, 0]) - p[:, 2]
         travel = np.clip(step, 0.05, 5.0)[s.frame]
         weight = s.spacing * s.score * travel / np.sqrt(variance)
         # Vertices alone: the points between them say nothing of their own.
-        keep = (weight > 0) & (np.arange(len(s)) % (2 * t.points.shape[1] - 1) % 2 == 0)
+        keep = (weight > 0) & (np.arange(len(s)) % each % 2 == 0)
         own = (np.full(len(s), k), s.frame + first[k], kind, local, angle, weight, variance)
         parts.append(tuple(a[keep] for a in own))
     return Cloud(*(np.concatenate(a) for a in zip(*parts, strict=True)))
