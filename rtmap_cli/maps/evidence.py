@@ -81,7 +81,8 @@ class Policy:
 
     ``delete_below``, ``insert_above``: probability of existence below which an element is gone,
     above which a new one is real; ``first_above`` the same where there is no map yet: what is
-    improbable is kept as such, and goes when further drives do not find it. ``delete_traversals``,
+    improbable is kept as such, and goes when further drives do not find it; ``first_log_odds``: in
+    a class without any, log-odds with which stretches of lines are kept. ``delete_traversals``,
     ``insert_traversals``: drives that must have looked at (seen) it; where only one drive looked at
     a new element, one is enough only for a first map. ``new_log_odds``: log-odds that a found
     candidate is real before the votes. ``correlation_m``: one vote of a line stands for that many
@@ -93,6 +94,7 @@ class Policy:
     delete_below: float = 0.2
     insert_above: float = 0.5
     first_above: float = 0.04
+    first_log_odds: float = 1.0
     delete_traversals: int = 2
     insert_traversals: int = 2
     new_log_odds: float = -1.0

@@ -163,7 +163,7 @@ def _supported(
         real = stretches(
             evidence[index],
             stations.spacing[index] / policy.correlation_m,
-            policy.new_log_odds,
+            policy.new_log_odds if before else policy.first_log_odds,
             policy.switch,
             ring,
         )
