@@ -151,13 +151,16 @@ def fuse_region(
     prior: VectorMap,
     classes: Sequence[str],
     fused: Collection[str],
+    common: float = 0.0,
     policy: Policy | None = None,
 ) -> tuple[Fusion, list[Element]]:
-    """Evidence and fusion of one region, and its candidates that wait for another run.
+    """Evidence and fusion of one region, and its candidates that wait for another run; ``common``
+    is the variance (m²) of the place that all traversals share.
 
     Here the rooms of change detection and of fusion meet; workers call it by its name.
     """
     from rtmap_cli.maps.evidence import Policy, Settings
+    from rtmap_cli.maps.refit import FusionModel
     from rtmap_cli.steps.crowdsource.fuse import fuse
     from rtmap_cli.steps.detect_changes.evidence import gather_evidence
 
@@ -171,7 +174,8 @@ def fuse_region(
             able = [t for t in traversals if name in t.classes]
             evidence += gather_evidence(able, prior, [name], settings, fused) if able else []
     fresh = [t for t in traversals if t.run_id not in fused]
-    fusion = fuse(prior, evidence, fresh, traversals, settings.policy)
+    model = FusionModel(common=common)
+    fusion = fuse(prior, evidence, fresh, traversals, settings.policy, model)
     waiting = set(fusion.waiting)
     return fusion, [e.element for e in evidence if e.new and e.element.element_id in waiting]
 

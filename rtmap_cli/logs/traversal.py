@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.geometry.poses import xyyaw_of
+from rtmap_cli.geometry.poses import wrap_angle, xyyaw_of
+from rtmap_cli.logs.motion import Motion, MotionModel, motion_of
 from rtmap_cli.logs.run import OUTDATED, Run
 
 Array = NDArray[np.float64]
@@ -38,7 +39,8 @@ class Traversal:
     the network's own scales (the pose's part is kept apart: it is common to a frame).
     ``asked``: prior elements that the network was asked about, see ``Questions``. ``cut`` (n,):
     reaches the border of the range; ``localized``: the poses come from localization; ``classes``
-    that its model knows: of others its silence says nothing.
+    that its model knows: of others its silence says nothing; ``motion``: what GNSS and odometry
+    say of a drive that was not localized.
     """
 
     run_id: str
@@ -57,6 +59,7 @@ class Traversal:
     localized: bool = True
     model_sha256: str | None = None
     classes: tuple[str, ...] = ()
+    motion: Motion | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -65,6 +68,26 @@ class Traversal:
     def kilometres(self) -> float:
         """Distance driven between its frames."""
         return float(np.hypot(*np.diff(self.pose[:, :2], axis=0).T).sum()) / 1000
+
+    def moved(self, pose: Array, pose_covariance: Array) -> Traversal:
+        """The drive at other poses (m, 3) with other covariances (m, 3, 3), and what it saw."""
+        turn = wrap_angle(pose[:, 2] - self.pose[:, 2])
+        c, s = np.cos(turn), np.sin(turn)
+        rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=-2)
+
+        def put(points: Array, frame: Int) -> Array:
+            local = points - self.pose[frame, None, :2]
+            out: Array = np.einsum("nij,nvj->nvi", rotation[frame], local)
+            return out + pose[frame, None, :2]
+
+        r = rotation[self.frame]
+        return replace(
+            self,
+            pose=pose,
+            pose_covariance=pose_covariance,
+            points=put(self.points, self.frame),
+            covariance=np.einsum("nij,nvjk,nlk->nvil", r, self.covariance, r),
+        )
 
 
 @dataclass(frozen=True)
@@ -115,17 +138,6 @@ def usable_poses(run: Run) -> tuple[NDArray[np.bool_], Array, Array]:
     pose[usable] = xyyaw_of(run.poses.pose[j])
     axes = np.array([0, 1, 5])
     covariance[usable] = np.nan_to_num(run.poses.covariance[j][:, axes[:, None], axes])
-    return usable, pose, covariance
-    row = {int(f): i for i, f in enumerate(run.poses.frame)}
-    axes = np.array([0, 1, 5])
-    for i, f in enumerate(frames.frame):
-        j = row.get(int(f))
-        if j is None or run.poses.status[j] == "no-match":
-            # A frame lost among localized ones would smear what they agree on.
-            usable[i] = False
-            continue
-        pose[i] = xyyaw_of(run.poses.pose[j])
-        covariance[i] = np.nan_to_num(run.poses.covariance[j][np.ix_(axes, axes)])
     return usable, pose, covariance
 
 
@@ -195,6 +207,7 @@ def traversal_of(run: Run, min_score: float = FOUND_SCORE) -> Traversal:
         localized=run.poses is not None,
         model_sha256=run.info.get("model_sha256"),
         classes=tuple(str(c) for c in run.info["classes"]),
+        motion=None if run.poses is not None else motion_of(run.frames, pose, MotionModel()),
     )
 
 

@@ -139,7 +139,7 @@ class Policy:
 
     delete_below: float = 0.2
     insert_above: float = 0.5
-    first_above: float = 0.08
+    first_above: float = 0.04
     delete_traversals: int = 2
     delete_of: int = 5
     insert_traversals: int = 2
@@ -150,7 +150,7 @@ class Policy:
     max_false_alarms_per_km: float | None = None
     prior_log_odds: float = PRIOR_LOG_ODDS
     new_log_odds: float = -1.7
-    first_log_odds: float = -1.0
+    first_log_odds: float = 1.0
     correlation_m: float = 8.0
     switch: float = 2.0
     shortest_m: float = 4.0

@@ -39,14 +39,16 @@ class FusionModel:
     variance that all frames of a drive share (measured where two drives or more overlap);
     ``place_share``: part that every drive shares at a place and that never averages out;
     ``floor``: repeatability, no sigma is below it; ``huber``: offsets beyond that many sigmas
-    lose weight.
+    lose weight; ``common``: variance (m²) per axis of the place that all drives share, where they
+    were aligned to each other and to nothing else.
     """
 
     width: float = 2.0
     drive_share: float = 0.55
-    place_share: float = 0.1
+    place_share: float = 0.16
     floor: float = 0.04
     huber: float = 1.5
+    common: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -166,9 +168,9 @@ def combine(
         robust = np.minimum(1.0, model.huber / np.maximum(z, 1e-9))
     information = (robust / variance).sum(axis=0)
     some = information > 0
-    single = np.stack([d.variance for d in drives])
-    best = np.min(np.where(seen, single, np.inf), axis=0)
-    common = model.place_share * np.where(np.isfinite(best), best, 0.0) + model.floor**2
+    single = np.where(seen, np.stack([d.variance for d in drives]), 0.0)
+    total = np.where(some, (weight * robust).sum(axis=0), 1.0)
+    common = model.place_share * (weight * robust * single).sum(axis=0) / total + model.floor**2
     out = np.where(some, 1.0 / np.where(some, information, 1.0) + common, np.inf)
     return np.where(some, mean, np.nan), out
 

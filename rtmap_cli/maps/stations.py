@@ -27,6 +27,8 @@ GATE = 1.5
 """A detection farther than this (m) from a line does not belong to it."""
 MIN_COS = 0.80
 """Least cosine between the directions of a detection and a line (about 37°)."""
+HAIRPIN = 3.0
+"""A detection that turns back within such a way (m) has two sides."""
 MIN_STRETCH = 3.0
 """Shortest part of a detection (m) that can be assigned to a line on its own."""
 
@@ -77,7 +79,8 @@ class Stations:
 
 @dataclass(frozen=True)
 class Samples:
-    """Points along detections: ``detection`` (n,), ``xy`` (n, 2), ``tangent`` (n, 2), ``spacing``
+    """Points along detections: ``detection`` (n,) number of it (the two sides of a hairpin have two
+    numbers), ``xy`` (n, 2), ``tangent`` (n, 2), ``spacing``
     (n,) metres that each stands for, ``covariance`` (n, 2, 2), ``score`` (n,), ``frame`` (n,)."""
 
     detection: Int
@@ -217,7 +220,7 @@ def samples_of(points: Array, covariance: Array, score: Array, frame: Int) -> Sa
     spacing[:, 1:] += step / 2
     spacing[:, :-1] += step / 2
     return Samples(
-        np.repeat(np.arange(n), k),
+        np.repeat(np.arange(n), k) + np.cumsum(_hairpins(xy, step).ravel()),
         xy.reshape(-1, 2),
         tangent.reshape(-1, 2),
         spacing.ravel(),
@@ -225,6 +228,30 @@ def samples_of(points: Array, covariance: Array, score: Array, frame: Int) -> Sa
         np.repeat(score, k),
         np.repeat(frame, k),
     )
+
+
+def _hairpins(xy: Array, step: Array) -> NDArray[np.bool_]:
+    """(n, k) True at the first sample after a turn of more than 120° within some metres.
+
+    The two sides of a narrow island come in one detection, but are two lines.
+    """
+    n, k = xy.shape[:2]
+    reach = np.clip(np.round(HAIRPIN / np.maximum(step.mean(axis=1), 1e-3)), 2, k // 3).astype(int)
+    index, rows = np.arange(k), np.arange(n)[:, None]
+    ahead, behind = index + reach[:, None], index - reach[:, None]
+    inside = (behind >= 0) & (ahead < k)
+    a = xy[rows, np.minimum(ahead, k - 1)] - xy
+    b = xy - xy[rows, np.maximum(behind, 0)]
+    size = np.hypot(a[..., 0], a[..., 1]) * np.hypot(b[..., 0], b[..., 1])
+    cosine = np.where(inside, (a * b).sum(-1) / np.maximum(size, 1e-9), 1.0)
+    sharp = cosine < -0.5
+    out = np.zeros((n, k), bool)
+    for i in np.flatnonzero(sharp.any(axis=1)):
+        # Of the samples around a turn the sharpest one parts the sides.
+        around = np.flatnonzero(sharp[i])
+        for turn in np.split(around, np.flatnonzero(np.diff(around) > 1) + 1):
+            out[i, turn[cosine[i, turn].argmin()]] = True
+    return out
 
 
 def candidate_feet(
@@ -251,7 +278,7 @@ def candidate_feet(
     key = key[order]
     first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
     size = np.diff(np.append(first, len(key)))
-    far = np.abs(along)[order]
+    far = (along**2 + offset**2)[order]
     nearest = far == np.repeat(np.minimum.reduceat(far, first), size)
     # Of two that are as near the first station counts, whatever the order of the pairs.
     station = np.where(nearest, j[order], len(stations))

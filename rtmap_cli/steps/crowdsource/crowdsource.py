@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.logs.agreement import Agreement
-from rtmap_cli.logs.tracks import Track
+from rtmap_cli.logs.tracks import Track, read_stretch
+from rtmap_cli.logs.traversal import same_sigma
 from rtmap_cli.maps.element import VectorMap
+from rtmap_cli.steps.crowdsource.align.align import align
 from rtmap_cli.steps.crowdsource.astray import Astray
 from rtmap_cli.steps.crowdsource.fuse import Fusion, compared
 from rtmap_cli.steps.crowdsource.identity import keep_ids
 from rtmap_cli.steps.crowdsource.job import Compose, Job, Outcome, run_job
 from rtmap_cli.steps.crowdsource.stitch import stitch
 from rtmap_cli.steps.crowdsource.tiling import SIDE, plan
+
+Array = NDArray[np.float64]
 
 Workers = Callable[[Callable[[Job], Outcome], Sequence[Job]], Iterable[Outcome]]
 """Runs jobs and gives their outcomes in the order of the jobs (``engines``)."""
@@ -66,7 +73,8 @@ def crowdsource(
     tracks, bad = list(tracks), []
     while True:
         try:
-            outcomes = list(workers(partial(run_job, compose=compose), _jobs(task, tracks)))
+            jobs = _jobs(task, *_aligned(task, tracks))
+            outcomes = list(workers(partial(run_job, compose=compose), jobs))
             break
         except BadInput as error:
             broken = [t for t in tracks if error.where.startswith(str(t.path))]
@@ -113,12 +121,46 @@ def _astray(outcomes: Sequence[Outcome]) -> dict[str, str]:
     return out
 
 
-def _jobs(task: Task, tracks: Sequence[Track]) -> list[Job]:
+@dataclass(frozen=True)
+class _Placed:
+    """Poses (m, 3) and covariances (m, 3, 3) of runs that were put onto each other, by id, and
+    the variance (m²) of the place that they share."""
+
+    runs: dict[str, tuple[Array, Array]]
+    common: float = 0.0
+
+
+def _aligned(task: Task, tracks: Sequence[Track]) -> tuple[list[Track], _Placed]:
+    """Where nothing says where the runs are but they themselves, they are first put onto each
+    other: whole drives at once, before anything is cut into tiles."""
+    free = [t for t in tracks if not t.localized]
+    if not free or (len(task.prior) and not task.anew):
+        return list(tracks), _Placed({})
+    traversals = [read_stretch(t.path) for t in free]
+    if task.without_sigma:
+        traversals = [same_sigma(t) for t in traversals]
+    found = align(traversals)
+    runs = {t.run_id: (t.pose, t.pose_covariance) for t in found.traversals}
+    moved = [replace(t, xy=runs[t.run_id][0][:, :2]) if t.run_id in runs else t for t in tracks]
+    return moved, _Placed(runs, found.common)
+
+
+def _jobs(task: Task, tracks: Sequence[Track], placed: _Placed) -> list[Job]:
     """The regions with everything that a worker needs."""
     tracks = sorted(tracks, key=lambda t: t.run_id)
     classes = tuple(dict.fromkeys(c for t in tracks for c in t.classes))
-    regions = plan(tracks, list(task.prior), task.side)
-    return [Job(r, task.crs, classes, task.done, task.anew, task.without_sigma) for r in regions]
+    by_path = {t.path: t for t in tracks if t.run_id in placed.runs}
+    jobs = []
+    for region in plan(tracks, list(task.prior), task.side):
+        aligned = {}
+        for path, frames in region.parts:
+            if (track := by_path.get(path)) is not None:
+                pose, covariance = placed.runs[track.run_id]
+                read = np.ones(len(track), bool) if frames is None else np.isin(track.frame, frames)
+                aligned[track.run_id] = (pose[read], covariance[read])
+        known = task.crs, classes, task.done, task.anew, task.without_sigma
+        jobs.append(Job(region, *known, aligned, placed.common))
+    return jobs
 
 
 def _agreements(outcomes: Collection[Outcome]) -> dict[str, Agreement]:

@@ -21,6 +21,7 @@ from rtmap_cli.maps.evidence import (
 )
 from rtmap_cli.maps.existence import LIMIT, probability
 from rtmap_cli.maps.refit import FusionModel
+from rtmap_cli.steps.crowdsource.forks import OUTLINES, Branch, forked
 from rtmap_cli.steps.crowdsource.lines import fuse_lines, snap_ends
 from rtmap_cli.steps.crowdsource.rings import fuse_ring
 
@@ -211,15 +212,11 @@ def _inserted(evidence: Evidence, policy: Policy, charted: _Charted, out: Fusion
     stretch, counts = evidence.stretches[0], evidence.counts
     element = evidence.element
     first = not charted.near(element.points)
-    if float(probability(stretch.log_odds)) < (
-        policy.first_above if first else policy.insert_above
-    ):
+    least = policy.first_above if first else policy.insert_above
+    if float(probability(stretch.log_odds)) < least:
         return []
-    need = policy.insert_traversals
-    if first:
-        need = min(need, max(counts.traversals_in_view, 1))
     found, _ = counts.newest(policy.insert_of)
-    if found < need:
+    if not first and found < policy.insert_traversals:
         out.waiting.append(element.element_id)
         return []
     out.inserted.append(element.element_id)
@@ -246,19 +243,20 @@ def _geometry(
     model: FusionModel,
     out: Fusion,
 ) -> list[Element]:
-    done: dict[int, Element] = {}
+    done: dict[int, list[Element]] = {}
     for name in dict.fromkeys(p.element.class_name for p in pieces):
         index = [k for k, p in enumerate(pieces) if p.element.class_name == name]
         if name in RING_CLASSES:
             for k in index:
-                done[k] = _fused_ring(pieces[k], name, fresh, every, model, out)
+                done[k] = [_fused_ring(pieces[k], name, fresh, every, model, out)]
             continue
         group = [pieces[k] for k in index]
-        for k, element in zip(
-            index, _fused_lines(group, name, fresh, every, model, out), strict=True
-        ):
-            done[k] = element
-    return [done[k] for k in sorted(done)]
+        fused = _fused_lines(group, name, fresh, every, model, out)
+        parts = [[e] for e in fused]
+        if name not in OUTLINES:
+            parts = _at_forks(fused, [p.new for p in group], out)
+        done |= dict(zip(index, parts, strict=True))
+    return [element for k in sorted(done) for element in done[k]]
 
 
 def _fused_lines(
@@ -295,6 +293,27 @@ def _fused_lines(
             )
         )
     return elements
+
+
+def _at_forks(elements: list[Element], new: list[bool], out: Fusion) -> list[list[Element]]:
+    """New lines cut where others end on them; the longest part keeps the id."""
+    lines = [Branch(e.points, e.covariance, k) for k, e in enumerate(elements)]
+    parts: list[list[Branch]] = [[] for _ in elements]
+    for branch in forked(lines, new):
+        parts[branch.source].append(branch)
+    result = []
+    for element, own in zip(elements, parts, strict=True):
+        order = sorted(range(len(own)), key=lambda k: (-length(own[k].points), k))
+        names = {k: f"{element.element_id}.{r}" if r else element.element_id
+                 for r, k in enumerate(order)}  # fmt: skip
+        out.inserted += [n for n in names.values() if n != element.element_id]
+        result.append(
+            [
+                replace(element, element_id=names[k], points=b.points, covariance=b.covariance)
+                for k, b in enumerate(own)
+            ]
+        )
+    return result
 
 
 def _thinned(points: Array, covariance: Array | None) -> tuple[Array, Array | None]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,10 +21,12 @@ from rtmap_cli.steps.crowdsource.tiling import Box, Region, band_of
 Array = NDArray[np.float64]
 
 Compose = Callable[
-    [Sequence[Traversal], VectorMap, Sequence[str], Collection[str]], tuple[Fusion, list[Element]]
+    [Sequence[Traversal], VectorMap, Sequence[str], Collection[str], float],
+    tuple[Fusion, list[Element]],
 ]
-"""Traversals, prior, classes and the runs that are fused already → Fusion, and the candidates that
-wait. The rooms of detect_changes and crowdsource meet in the command that gives it."""
+"""Traversals, prior, classes, the runs that are fused already and the variance (m²) of the place
+that all of them share → Fusion, and the candidates that wait. The rooms of detect_changes and
+crowdsource meet in the command that gives it."""
 
 SAMPLE = 200
 """Detections of a run that are compared with the prior in each region."""
@@ -34,7 +36,11 @@ SHORTEST = 1.0
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that a worker needs: small, and the same wherever it runs."""
+    """Everything that a worker needs: small, and the same wherever it runs.
+
+    ``aligned``: poses (m, 3) and covariances (m, 3, 3) of the runs, by id, that were put onto each
+    other; ``common`` (m²): variance of the place that they then share.
+    """
 
     region: Region
     crs: str
@@ -42,6 +48,8 @@ class Job:
     fused: frozenset[str]
     anew: bool = False
     without_sigma: bool = False
+    aligned: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+    common: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -64,6 +72,9 @@ def run_job(job: Job, compose: Compose) -> Outcome:
     """Read the frames of a region, gather what they say and fuse it."""
     region = job.region
     traversals = [read_stretch(path, frames) for path, frames in region.parts]
+    traversals = [
+        t.moved(*job.aligned[t.run_id]) if t.run_id in job.aligned else t for t in traversals
+    ]
     known = VectorMap(region.known, job.crs)
     fresh = [t for t in traversals if t.run_id not in job.fused]
     agree = {t.run_id: agreement(t, known, SAMPLE) for t in fresh} if len(known) else {}
@@ -74,7 +85,7 @@ def run_job(job: Job, compose: Compose) -> Outcome:
         traversals = [same_sigma(t) for t in traversals]
     prior = VectorMap((), job.crs) if job.anew else known
     if traversals:
-        fusion, waiting = compose(traversals, prior, job.classes, job.fused)
+        fusion, waiting = compose(traversals, prior, job.classes, job.fused, job.common)
     else:
         fusion, waiting = Fusion(prior, untouched=[e.element_id for e in prior]), []
     used = frozenset(t.run_id for t in traversals)

@@ -17,8 +17,11 @@ Int = NDArray[np.int64]
 
 SIMPLIFY = 0.25
 """A vertex of a new outline that lies so near (m) to the line of its neighbours is left out."""
-NEAR = 3.5
-"""A detection whose centre is farther (m) from the element's is not averaged."""
+NEAR, REACH, FARTHEST = 3.5, 2.2, 8.0
+"""A detection whose centre is farther (m) from the element's is not averaged, unless that is
+within so many of its sigmas and this distance (m)."""
+WHOLE = 0.25
+"""Log of how much longer or shorter the outline of a detection at the border may be."""
 
 
 def _drive_mean(
@@ -45,7 +48,7 @@ def _combined(
         w = weight * np.minimum(1.0, model.huber / np.maximum(z, 1e-9))
         centre = (means * w[..., None]).sum(0) / w.sum(0)[:, None]
     information = (w / weight / variances[:, None]).sum(axis=0)
-    common = model.place_share * variances.min() + model.floor**2
+    common = model.place_share * variances.min() + model.floor**2 + model.common
     return centre, 1.0 / information + common
 
 
@@ -89,15 +92,29 @@ def fuse_ring(
 
 
 def _near(traversal: Traversal, class_name: str, reference: Array) -> Int:
-    """Whole detections of the class whose centre lies at the element's."""
-    mine = np.flatnonzero((traversal.class_name == class_name) & ~traversal.cut)
+    """Detections of the class whose centre lies at the element's; of those that the range cuts
+    the ones that hold most of the element."""
+    mine = np.flatnonzero(traversal.class_name == class_name)
     centre = reference.mean(axis=0)
+    cov = traversal.covariance[mine]
+    sigma = np.sqrt((cov[..., 0, 0] + cov[..., 1, 1]).mean(axis=1) / 2)
+    reach = np.clip(REACH * sigma, NEAR, FARTHEST)
     # Nearly all are elsewhere: their outlines need not be drawn to see that.
     points = traversal.points[mine]
     size = np.ptp(points, axis=1).max(axis=1, initial=0.0)
-    mine = mine[np.hypot(*(points.mean(axis=1) - centre).T) <= NEAR + size]
-    centres = open_rings(traversal.points[mine]).mean(axis=1)
-    return mine[np.hypot(*(centres - centre).T) <= NEAR]
+    close_by = np.hypot(*(points.mean(axis=1) - centre).T) <= reach + size
+    mine, reach = mine[close_by], reach[close_by]
+    rings = open_rings(traversal.points[mine])
+    near = np.hypot(*(rings.mean(axis=1) - centre).T) <= reach
+    share = np.maximum(_outline(rings), 1e-3) / _outline(reference[None])
+    near &= ~traversal.cut[mine] | (np.abs(np.log(share)) <= WHOLE)
+    return mine[near]
+
+
+def _outline(rings: Array) -> Array:
+    """(n,) length of the outlines of rings (n, k, 2), metres."""
+    step = rings - np.roll(rings, 1, axis=1)
+    return np.asarray(np.hypot(step[..., 0], step[..., 1]).sum(axis=1))
 
 
 def _moved(

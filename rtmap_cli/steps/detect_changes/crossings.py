@@ -27,6 +27,8 @@ NEAR = 3.5
 """Rings whose features (centre, direction) differ by more than this (m) are different ones."""
 SIGMAS = 3.0
 """… unless their own position is known no better than so many standard deviations allow."""
+CUT_SHARE = 0.3
+"""What a detection that the range cuts counts, against a whole one, where a ring lies."""
 VISIBLE = 0.65
 """A ring is in view of a frame when this share of its outline and middle is."""
 INSIDE = 0.6
@@ -97,6 +99,11 @@ def _windows(traversal: Traversal, frame: Int) -> Array:
     return np.einsum("nij,kj->nki", turn, corners) + pose[:, None, :2]
 
 
+def _near(variance: Array) -> Array:
+    """(n,) farthest features of the ring that detections of a variance (m²) may belong to."""
+    return np.clip(SIGMAS * np.sqrt(variance), NEAR, 2 * NEAR)
+
+
 def match(rings: Rings, places: Array, first: int = 0) -> Int:
     """(n,) index of the place (m, 80, 2) that each detection belongs to, or -1.
 
@@ -110,7 +117,7 @@ def match(rings: Rings, places: Array, first: int = 0) -> Int:
         return out
     from scipy.spatial import cKDTree
 
-    gate = np.clip(SIGMAS * np.sqrt(rings.variance), NEAR, 2 * NEAR)
+    gate = _near(rings.variance)
     near = cKDTree(rings.feature).sparse_distance_matrix(
         cKDTree(features(places)), 2 * NEAR, output_type="ndarray"
     )
@@ -190,20 +197,25 @@ def new_rings(prior: Array, drives: Sequence[Rings], least: float = 0.8) -> Arra
     found = prior[:0]
     for cut in (False, True):
         known = np.concatenate([prior, found])
-        keep = [(match(r, known) < 0) & (r.cut == cut) for r in drives]
+        keep = [(match(r, known) < 0) & (r.cut | (not cut)) for r in drives]
         parts = [
-            (r.points[k], r.feature[k], r.score[k], r.variance[k])
+            (
+                r.points[k],
+                r.feature[k],
+                r.score[k] * np.where(r.cut[k] & (not cut), CUT_SHARE, 1.0),
+                r.variance[k],
+            )
             for r, k in zip(drives, keep, strict=True)
         ]
         points, feature, score, variance = (np.concatenate(p) for p in zip(*parts, strict=True))
         if len(points):
-            weight = score / np.maximum(variance, 0.01) ** SHARPNESS
-            found = np.concatenate([found, _means(points, feature, score, weight, least)])
+            found = np.concatenate([found, _means(points, feature, score, variance, least)])
     return found
 
 
-def _means(points: Array, feature: Array, score: Array, weight: Array, least: float) -> Array:
+def _means(points: Array, feature: Array, score: Array, variance: Array, least: float) -> Array:
     """Mean rings of the clusters, twice reassigned to the nearest one."""
+    weight, near = score / np.maximum(variance, 0.01) ** SHARPNESS, _near(variance)
     groups = _clusters(feature, score, least)
     means = points[:0]
     for k in range(3):
@@ -214,7 +226,7 @@ def _means(points: Array, feature: Array, score: Array, weight: Array, least: fl
             break
         means = _apart(means)
         distance, owner = _nearest(features(means), feature)
-        groups = [np.flatnonzero((owner == i) & (distance <= NEAR)) for i in range(len(means))]
+        groups = [np.flatnonzero((owner == i) & (distance <= near)) for i in range(len(means))]
         groups = [g for g in groups if len(g) and score[g].sum() >= least]
     return means
 

@@ -31,6 +31,7 @@ from rtmap_cli.maps.existence import (
 from rtmap_cli.maps.sight import SightModel
 from rtmap_cli.maps.stations import GATE, MIN_COS, Samples, Stations, stations_of
 from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, ring_counts
+from rtmap_cli.steps.detect_changes.doubles import split_doubles
 from rtmap_cli.steps.detect_changes.lines import (
     all_line_counts,
     class_samples,
@@ -100,6 +101,8 @@ def _lines(
     feet = [assign_once(known, s)[0] for s in samples]
     sight = sight_of(known, traversals, samples, feet, policy.view_margin_m)
     found = new_lines(name, known, traversals, samples)
+    found = refit_lines(found, old, traversals, samples, settings.fusion)
+    found = split_doubles(found, old, samples)
     for _ in range(2):
         found = refit_lines(found, old, traversals, samples, settings.fusion)
     for last in (False, True):
@@ -215,7 +218,7 @@ def _supported(
         real = stretches(
             evidence[index],
             stations.spacing[index] / policy.correlation_m,
-            policy.new_log_odds,
+            policy.new_log_odds if before else policy.first_log_odds,
             policy.switch,
             ring,
         )

@@ -18,6 +18,10 @@ Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
+TIP = 2.5
+"""Ends side by side, so near (m) and looking the same way, are the tip of an outline."""
+
+
 @dataclass(frozen=True)
 class RidgePoints:
     """``xy`` (n, 2) m, ``direction`` (n, 2) unit vectors along the ridge (sign free), ``value``
@@ -294,6 +298,9 @@ def _join_cost(
             return far, None
         if min(d @ step, -(e @ step)) / far >= np.cos(angle):
             return far, None
+    if corner > 0 and far <= TIP and facing < -0.7 and abs(float(d @ step)) <= TIP:
+        # The two sides of a narrow island at its tip.
+        return 2 * corner + far, None
     if corner > 0 and -0.5 < facing < np.cos(angle):
         cross = d[0] * e[1] - d[1] * e[0]
         if abs(cross) > 0.3:

@@ -1,0 +1,1 @@
+"""Drives put onto each other before they are fused, where no map says where they are."""
