@@ -25,6 +25,8 @@ Mask = NDArray[np.bool_]
 
 PLACE = 2.0
 """Length (m) of a line that one frame sees once; vertices of detections lie nearer than that."""
+WIDE = 2.5
+"""A detection so many sigmas from a line may belong to it, ..."""
 FLOOR = 0.12
 """Standard deviation (m) of the map and of the pose, beside that of a detection."""
 
@@ -58,7 +60,6 @@ def assign_once(
     stations: Stations,
     samples: Samples,
     first: Mask | None = None,
-    gate: float = GATE,
     rounds: int = 4,
 ) -> tuple[Feet, Mask]:
     """Assign stretches of detections to strands, and say which samples found one.
@@ -66,11 +67,13 @@ def assign_once(
     A detection goes to the strand of largest gain Σ spacing · (1 − (offset / gate)²); of those of
     one frame at one place of a strand the one of largest mean gain stays. What is left goes to the
     next one, for ``rounds`` rounds. With ``first`` (stations,) the lines of these stations
-    choose before all others.
+    choose before all others. The gate is ``GATE``, or ``WIDE`` sigmas of the usual detection where
+    that is more.
     """
     taken = np.zeros(len(samples), bool)
     parts: list[Feet] = []
     if len(stations) and len(samples):
+        gate = float(np.clip(WIDE * np.median(across_sigma(samples)), GATE, 2 * GATE))
         feet = _Feet(stations, samples, gate)
         stages = [None] if first is None else [first, ~first]
         for stage in stages:

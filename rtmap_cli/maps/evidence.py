@@ -149,7 +149,7 @@ class Policy:
     min_probability: float | None = None
     max_false_alarms_per_km: float | None = None
     prior_log_odds: float = PRIOR_LOG_ODDS
-    new_log_odds: float = -1.7
+    new_log_odds: float = -1.3
     first_log_odds: float = 1.0
     correlation_m: float = 8.0
     switch: float = 2.0

@@ -37,7 +37,8 @@ class VoteModel:
 
     ``found``: usual hit rate per view; ``hard``: share of places that are hard to see, found at
     ``hard_rate`` × found; ``false_rate``: hits per view where nothing is, ``picked_rate``: the
-    same at places that were picked because something was found there; ``ghost``: share of the
+    same at places that were picked because something was found there (``spill``: share of these
+    at which that is so in all drives); ``ghost``: share of the
     drives in which a false detection stays in place, seen at ``ghost_rate`` × found;
     ``strength``: how alike the frames of a drive are (beta-binomial pseudo-count, lower = more
     alike), ``false_strength`` the same of false detections, which clump; ``most_views``: frames
@@ -49,6 +50,7 @@ class VoteModel:
     hard_rate: float = 0.35
     false_rate: float = 0.02
     picked_rate: float = 0.06
+    spill: float = 0.2
     ghost: float = 0.05
     ghost_rate: float = 0.4
     strength: float = 8.0
@@ -86,6 +88,31 @@ def drive_log_likelihoods(
     ghost = _log_beta_binomial(h, m, model.ghost_rate * model.found, model.false_strength)
     absent = np.logaddexp(np.log1p(-model.ghost) + false, np.log(model.ghost) + ghost)
     return np.stack([easy, hard, absent])
+
+
+def joint_log_likelihoods(
+    hits: Array, views: Array, model: VoteModel, picked: NDArray[np.bool_]
+) -> Array:
+    """(3, n) log-likelihoods of the counts (drives, n) of all drives, as ``drive_log_likelihoods``.
+
+    A place with nothing at it was ``picked`` (n,) because of what *one* of the drives, nobody knows
+    which, falsely found there, and the others have no more false detections there than elsewhere;
+    or, at a share ``spill`` of the places, because all drives find false things there, which are
+    detections of something beside it.
+    """
+    each = drive_log_likelihoods(hits, views, model)
+    out: Array = each.sum(axis=1)
+    looked = views[:, picked] > 0
+    if looked.any():
+        chosen = drive_log_likelihoods(hits[:, picked], views[:, picked], model, picked=True)
+        gain = np.where(looked, chosen[2] - each[2][:, picked], -np.inf)
+        some = looked.any(axis=0)
+        one = _log_sum_exp(gain[:, some]) - np.log(looked[:, some].sum(axis=0))
+        every = np.where(looked, gain, 0.0)[:, some].sum(axis=0)
+        out[2, np.flatnonzero(picked)[some]] += np.logaddexp(
+            np.log1p(-model.spill) + one, np.log(model.spill) + every
+        )
+    return out
 
 
 def log_odds_of(votes: Array, model: VoteModel) -> Array:

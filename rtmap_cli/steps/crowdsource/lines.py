@@ -17,6 +17,7 @@ from rtmap_cli.maps.refit import (
     measured_share,
     solve_vertices,
 )
+from rtmap_cli.maps.registration import registered
 from rtmap_cli.maps.stations import Stations, assign, samples_of, smoother, stations_of
 
 Array = NDArray[np.float64]
@@ -27,6 +28,8 @@ NEW_SIGMA = 1.0
 """Standard deviation (m) of a new line's vertices before its detections are fused."""
 END_SIGMA = 0.8
 """Along-line standard deviation (m) of an open end: detections are cut short there."""
+OVERLAP = 0.3
+"""A new line that is joined to an end starts so far (m) beyond it."""
 LONGEST_MOVE = 1.0
 """A vertex moves no farther (m) in one fusion: more is a wrong assignment."""
 
@@ -79,7 +82,13 @@ def fuse_lines(
     stations = stations_of([p[:, :2] for p in points])
     is_new = np.asarray(new, bool)
     old = _offsets(stations, class_name, fresh, model)
-    late = old if len(fresh) == len(every) else _offsets(stations, class_name, every, model)
+    late = old
+    if is_new.any() and (len(fresh) < len(every) or not is_new.all()):
+        # New lines lie where they do relative to what the map knows around them.
+        known = stations_of(
+            [p[:, :2] for p, fresh_line in zip(points, new, strict=True) if not fresh_line]
+        )
+        late = _offsets(stations, class_name, every, model, known)
     pick = is_new[stations.line]
     offset, variance = np.where(pick, late, old)
     start = np.cumsum([0, *(len(p) for p in points)])
@@ -96,11 +105,12 @@ def fuse_lines(
     move, after = solve_vertices(vertices, chain, before, stations, offset, variance, 1.5)
     size = np.hypot(move[:, 0], move[:, 1])
     move *= np.minimum(1.0, LONGEST_MOVE / np.maximum(size, 1e-9))[:, None]
+    seen = [bool(np.isfinite(variance[stations.of_line(k)]).any()) for k in range(len(points))]
+    move = _at_nodes(vertices, move, np.repeat(seen, np.diff(start)))
     out = []
     for k, p in enumerate(points):
         part = slice(start[k], start[k + 1])
-        seen = np.isfinite(variance[stations.of_line(k)]).any()
-        if not seen:
+        if not seen[k]:
             out.append(Fused(p, covariances[k], False))
             continue
         xy = p[:, :2] + move[part]
@@ -114,6 +124,17 @@ def fuse_lines(
     return out
 
 
+def _at_nodes(vertices: Array, move: Array, seen: NDArray[np.bool_]) -> Array:
+    """(n, 2) displacements, the same for all vertices at one place: lines that met in a vertex meet
+    again. Where one of them is not ``seen`` (n,) and stays, they all do."""
+    key = np.round(vertices * 1000).astype(np.int64)
+    _, node, number = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    node = node.ravel()
+    mean = np.stack([np.bincount(node, move[:, k]) / number for k in (0, 1)], axis=-1)
+    mean[np.bincount(node, ~seen) > 0] = 0.0
+    return np.where((number > 1)[node, None], mean[node], move)
+
+
 def _known_along(covariance: Array, xy: Array) -> Array:
     """Along a line a vertex may lie anywhere; only the ends are uncertain there, by how
     detections are cut. Interior vertices slide freely and keep what the system gave them."""
@@ -125,9 +146,14 @@ def _known_along(covariance: Array, xy: Array) -> Array:
 
 
 def _offsets(
-    stations: Stations, class_name: str, traversals: Sequence[Traversal], model: FusionModel
+    stations: Stations,
+    class_name: str,
+    traversals: Sequence[Traversal],
+    model: FusionModel,
+    known: Stations | None = None,
 ) -> tuple[Array, Array]:
-    """Offset and variance of every station over the traversals (NaN, inf where unseen)."""
+    """Offset and variance of every station over the traversals (NaN, inf where unseen); with
+    ``known`` lines what these show as displaced is put back first."""
     n = len(stations)
     if not traversals:
         return np.full(n, np.nan), np.full(n, np.inf)
@@ -138,6 +164,8 @@ def _offsets(
         samples = samples_of(
             traversal.points[k], traversal.covariance[k], traversal.score[k], traversal.frame[k]
         )
+        if known is not None:
+            samples = registered(samples, known)
         feet, _ = assign(stations, samples)
         noise = pose_variance(
             traversal,
@@ -181,4 +209,9 @@ def snap_ends(points: list[Array], new: Sequence[bool], reach: float, angle: flo
         if a in used or b in used:
             continue
         used |= {a, b}
-        points[owner[a][0]][owner[a][1], :2] = points[owner[b][0]][owner[b][1], :2]
+        (k, end), target = owner[a], points[owner[b][0]][owner[b][1], :2]
+        line = points[k] if end else points[k][::-1]
+        # What reaches beyond the end that it is put onto would run back and forth.
+        over = (line[:, :2] - target) @ outward[b] < OVERLAP
+        count = 1 if over.all() else max(int(np.argmin(over[::-1])), 1)
+        line[-count:, :2] = target

@@ -28,6 +28,7 @@ from rtmap_cli.maps.existence import (
     runs_of,
     stretches,
 )
+from rtmap_cli.maps.registration import registered
 from rtmap_cli.maps.sight import SightModel
 from rtmap_cli.maps.stations import GATE, MIN_COS, Samples, Stations, stations_of
 from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, ring_counts
@@ -94,9 +95,9 @@ def _lines(
     settings: Settings,
 ) -> list[Evidence]:
     policy, now_ns = settings.policy, newest_ns(traversals)
-    samples = [class_samples(t, name) for t in traversals]
     old = [e.xy for e in prior]
     known = stations_of(old)
+    samples = [registered(class_samples(t, name), known) for t in traversals]
     sigma = [offset_sigma(known, s) for s in samples]
     feet = [assign_once(known, s)[0] for s in samples]
     sight = sight_of(known, traversals, samples, feet, policy.view_margin_m)
@@ -258,6 +259,8 @@ def _line_evidence(
         for run in runs_of(real == flag, ring and bool(real.any()) and not real.all()):
             parts.append(_stretch(element, stations, votes, index, run, flag, before, policy))
     mean = _mean_evidence(evidence, stations.spacing[index], looked)
+    if stations.spacing[index].sum() < policy.shortest_m:
+        mean = max(mean, 0.0)
     return Evidence(
         element,
         sorted(parts, key=lambda p: p.start),
@@ -294,6 +297,9 @@ def _stretch(
     extent = float(stations.spacing[places].sum())
     ratio *= min(1.0, max(extent / policy.correlation_m, 0.3))
     whole = len(run) == len(index)
+    if whole and exists and extent < policy.shortest_m:
+        # Nobody reports pieces of that length: that they are not found says nothing.
+        ratio = max(ratio, 0.0)
     geometry = element.points if whole else _cut_out(element.points, stations, places)
     odds = float(np.clip(before + ratio, -LIMIT, LIMIT))
     counts = votes.counts(places[looked])

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rtmap_cli.maps.existence import (
     PRIOR_LOG_ODDS,
     VoteModel,
-    drive_log_likelihoods,
+    joint_log_likelihoods,
     log_odds_of,
     logit,
     probability,
@@ -41,7 +41,9 @@ MOST = 2.0
 OWN, CUT = 0.5, 1.3
 """Share of the variance of an offset that is not common to a drive; ½ z² between the halves of a
 Gaussian that is cut in two (means at ± 0.8 σ)."""
-NEW_LOG_ODDS = -1.7
+SHARED = 0.2
+"""Correlation of the offsets that two drives have at a place."""
+NEW_LOG_ODDS = -1.3
 """Log-odds of a candidate before the votes."""
 SURE = 3.0
 """Log-odds from which on a line of the map is not in question."""
@@ -106,10 +108,13 @@ def weighed(
     giver, taker = _owners(asked, pairs, stations)
     scale = stations.spacing[giver] / np.maximum(stations.spacing[taker], 0.25)
     np.add.at(extra, taker, lost[giver] * scale)
+    strain = np.zeros((len(sigma), len(extra)))
     for k, own in enumerate(sigma):
         moved = np.clip(full.counts[k].hits - without.counts[k].hits, 0.0, 1.0)
-        strain = _strained(full.feet[k], without.feet[k], own, stations)
-        extra[asked] += (moved * strain)[asked]
+        strain[k] = moved * _strained(full.feet[k], without.feet[k], own, stations)
+    # What all drives share at a place is no independent sign.
+    number = np.maximum((strain != 0).sum(axis=0), 1)
+    extra[asked] += (strain.sum(axis=0) / (1 + SHARED * (number - 1)))[asked]
     out = replace(votes, extra=extra)
     if picked[asked].any():
         extra = extra.copy()
@@ -167,10 +172,8 @@ def _around(feet: Feet, stations: Stations, reach: int = 4) -> tuple[Array, Mask
 
 def _total(drives: Sequence[DriveCounts], model: VoteModel, picked: Mask) -> Array:
     """(3, n) log-likelihoods over some drives."""
-    out = np.zeros((3, len(picked)))
-    for d in drives:
-        out += drive_log_likelihoods(d.hits, d.views, model, picked)
-    return out
+    hits, views = (np.stack([getattr(d, name) for d in drives]) for name in ("hits", "views"))
+    return joint_log_likelihoods(hits, views, model, picked)
 
 
 def _marginal(votes: Array, model: VoteModel) -> Array:

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.evidence import Counts, DriveEvidence
-from rtmap_cli.maps.existence import VoteModel, drive_log_likelihoods, fitted, log_odds_of
+from rtmap_cli.maps.existence import (
+    VoteModel,
+    drive_log_likelihoods,
+    fitted,
+    joint_log_likelihoods,
+    log_odds_of,
+)
 from rtmap_cli.maps.sight import Look, SightModel, measured_sight
 from rtmap_cli.maps.stations import STEP, Feet, Samples, Stations
 from rtmap_cli.maps.visibility import Views, views
@@ -175,10 +181,12 @@ def _asked_stations(
 @dataclass(frozen=True)
 class Ballot:
     """The drives' counts at n places, put together: ``votes`` (drives, 3, n) log-likelihoods,
-    ``in_view`` and ``seen`` (drives, n) flags, and the model that judged them; ``extra`` (n,)
-    log-likelihood that other places lose when these do not exist."""
+    ``joint`` (3, n) those of all drives, ``in_view`` and ``seen`` (drives, n) flags, and the model
+    that judged them; ``extra`` (n,) log-likelihood that other places lose when these do not
+    exist."""
 
     votes: Array
+    joint: Array
     in_view: Mask
     seen: Mask
     drives: Sequence[DriveCounts]
@@ -202,7 +210,7 @@ class Ballot:
     @property
     def evidence(self) -> Array:
         """(n,) log-likelihood ratio exists : absent."""
-        return log_odds_of(self.votes.sum(axis=0), self.model) + self.extra
+        return log_odds_of(self.joint, self.model) + self.extra
 
     def counts(self, index: Int) -> Counts:
         """Counts of the stretch of places ``index``: frames that found or could see any of it."""
@@ -289,6 +297,7 @@ def ballot(
     votes = [drive_log_likelihoods(h, v, model, picked) for h, v in zip(hits, looked, strict=True)]
     return Ballot(
         np.stack(votes),
+        joint_log_likelihoods(hits, looked, model, picked),
         looked >= 1.0,
         (looked > 0) & (hits >= SEEN_SHARE * model.found * looked),
         drives,
