@@ -61,19 +61,22 @@ def assign_once(
     samples: Samples,
     first: Mask | None = None,
     rounds: int = 4,
+    wide: bool = True,
 ) -> tuple[Feet, Mask]:
     """Assign stretches of detections to strands, and say which samples found one.
 
     A detection goes to the strand of largest gain Σ spacing · (1 − (offset / gate)²); of those of
     one frame at one place of a strand the one of largest mean gain stays. What is left goes to the
     next one, for ``rounds`` rounds. With ``first`` (stations,) the lines of these stations
-    choose before all others. The gate is ``GATE``, or ``WIDE`` sigmas of the usual detection where
-    that is more.
+    choose before all others. The gate is ``GATE``; ``wide``: ``WIDE`` sigmas of the usual
+    detection where that is more.
     """
     taken = np.zeros(len(samples), bool)
     parts: list[Feet] = []
     if len(stations) and len(samples):
-        gate = float(np.clip(WIDE * np.median(across_sigma(samples)), GATE, 2 * GATE))
+        gate = GATE
+        if wide:
+            gate = float(np.clip(WIDE * np.median(across_sigma(samples)), GATE, 2 * GATE))
         feet = _Feet(stations, samples, gate)
         stages = [None] if first is None else [first, ~first]
         for stage in stages:

@@ -145,7 +145,8 @@ def _line_votes(
     before = int(np.searchsorted(stations.line, old))
     margin = settings.policy.view_margin_m
     drives = stations, ids, traversals, samples, margin, sight
-    full = all_line_counts(*drives)
+    # Lines that are all new part best by what is nearest; known ones may be seen farther off.
+    full = all_line_counts(*drives, wide=old > 0)
     votes = ballot(full.counts, traversals, settings.votes, fresh, before, APART)
     picked = np.arange(len(stations)) >= before
     pairs = neighbours(stations)

@@ -157,13 +157,15 @@ def all_line_counts(
     margin: float,
     sight: SightModel,
     first: NDArray[np.bool_] | None = None,
+    wide: bool = True,
 ) -> Play:
     """Counts of every drive at all stations; every detection goes to one line only.
 
-    With ``first`` (stations,) these choose their detections before the others.
+    With ``first`` (stations,) these choose their detections before the others. ``wide`` as in
+    ``assign_once``.
     """
     counts, feet = [], []
     for traversal, s in zip(traversals, samples, strict=True):
-        feet.append(assign_once(stations, s, first)[0])
+        feet.append(assign_once(stations, s, first, wide=wide)[0])
         counts.append(line_counts(stations, ids, traversal, s, feet[-1], margin, sight))
     return Play(counts, feet)
