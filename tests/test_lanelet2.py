@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from sample_lanelet2 import CRS, EAST, LANE, NORTH, Osm, assert_same, parse, street
 
+from rtmap_cli.formats.lanelet2.osm import OsmFile, Relation, read_osm, write_osm
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import read_map
 
@@ -219,3 +220,13 @@ def test_a_crossing_turning_either_way_comes_back(rtmap: Rtmap, tmp_path: Path) 
     assert first.keys() == second.keys() == rings.keys()
     for name, element in first.items():
         np.testing.assert_allclose(second[name].points, element.points, atol=1e-3)
+
+
+def test_any_text_in_tags_comes_back(tmp_path: Path) -> None:
+    """Quotes, markup, line ends and letters of all kinds; what XML cannot hold is replaced."""
+    odd = {"name": "Große \"Straße\" & 'Weg' <1>", "note": "two\nlines\tand\r", "字": "道路"}
+    osm = OsmFile(relations={1: Relation([], odd), 2: Relation([], {"a": "\x00\x1b\ufffe\ud800"})})
+    write_osm(osm, tmp_path / "out.osm")
+    back = read_osm(tmp_path / "out.osm").relations
+    assert back[1].tags == odd
+    assert back[2].tags == {"a": "\ufffd" * 4}

@@ -11,6 +11,7 @@ import pytest
 from sample_lanelet2 import CRS, EAST, NORTH, Osm, assert_same, parse, street
 
 from rtmap_cli.maps.crs import to_lonlat
+from rtmap_cli.maps.store import read_map
 
 Rtmap = Callable[..., Any]
 Features = dict[str, Any]
@@ -36,6 +37,10 @@ def edited(rtmap: Rtmap, tmp_path: Path) -> Callable[..., tuple[Osm, dict[str, i
         again = tmp_path / "again.osm"
         rtmap("export", "lanelet2", tmp_path / "edited", "-o", again)
         assert again.read_bytes() == out.read_bytes()
+        crs = read_map(tmp_path / "edited").crs
+        rtmap("import", "lanelet2", out, "--crs", crs, "-o", tmp_path / "back", *options)
+        rtmap("export", "lanelet2", tmp_path / "back", "-o", tmp_path / "last.osm")
+        assert_same(parse(out), parse(tmp_path / "last.osm"))
         return parse(out), json.loads(said.out)["notes"]
 
     return call
@@ -227,10 +232,35 @@ def test_new_elements(rtmap: Rtmap, tmp_path: Path, edited: Any) -> None:
     assert notes == {}
     ids = [*out.ways, *out.relations, *out.nodes]
     assert min(ids) > 0 and max(ids) < 2**53
-    said = rtmap("import", "lanelet2", tmp_path / "out.osm", "-o", tmp_path / "b", "--json").out
-    assert json.loads(said)["elements"]["ped_crossing"] == 2
-    rtmap("export", "lanelet2", tmp_path / "b", "-o", tmp_path / "c.osm")
-    assert_same(out, parse(tmp_path / "c.osm"))
+    names = read_map(tmp_path / "back").by_id()
+    assert {name: names[name].class_name for name in "dbrsp"} == {
+        "d": "divider",
+        "b": "boundary",
+        "r": "boundary",
+        "s": "stop_line",
+        "p": "ped_crossing",
+    }
+
+
+def test_a_new_line_that_was_cut_keeps_its_name(rtmap: Rtmap, tmp_path: Path, edited: Any) -> None:
+    """From rtmap to Lanelet2 and back, shortened there, and to Lanelet2 again."""
+
+    def change(features: Features) -> None:
+        features["d"] = line("d", "divider", (0, 1), (9, 1), (40, 1))
+
+    edited(change)
+    before = parse(tmp_path / "out.osm").ways
+    rtmap("export", "geojson", tmp_path / "back", "-o", tmp_path / "back.geojson")
+    collection = json.loads((tmp_path / "back.geojson").read_text(encoding="utf-8"))
+    (feature,) = (f for f in collection["features"] if f["id"] == "d")
+    reshape(feature, (9, 1), (40, 1))
+    (tmp_path / "cut.geojson").write_text(json.dumps(collection), encoding="utf-8")
+    rtmap("import", "geojson", tmp_path / "cut.geojson", "-o", tmp_path / "cut")
+    rtmap("export", "lanelet2", tmp_path / "cut", "-o", tmp_path / "cut.osm")
+    after = parse(tmp_path / "cut.osm").ways
+    assert before.keys() == after.keys()
+    (number,) = (k for k, (_, tags) in after.items() if tags.get("rtmap:id") == "d")
+    assert len(after[number][0]) == 2
 
 
 @pytest.mark.parametrize(

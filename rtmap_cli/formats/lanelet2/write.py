@@ -174,33 +174,39 @@ class _Writer:
         return out
 
     def add_ways(self, s: Source, ways: list[list[Any]], pieces: Sequence[Piece]) -> None:
-        """The ways of an element that came from some."""
+        """The ways of an element that came from some: those that are whole, then the others."""
         own = _way_tags(s.element)
         first = min(int(w[0]) for w in ways)
-        alone = len(ways) == 1 and len(pieces) == 1
-        named = own | ({ID_TAG: s.name} if alone and s.name != f"way-{first}" else {})
-        same = alone and first not in self.bounds_of_lanelets
         backwards = {int(w[0]): bool(w[2]) for w in ways}
+        # An id that rtmap gave goes with the longest piece; one that is a way's with that way.
+        given = s.name != f"way-{first}"
+        longest = max(range(len(pieces)), key=lambda k: pieces[k].stop - pieces[k].start)
+        whole = {
+            k: p.way
+            for k, p in enumerate(pieces)
+            if p.way is not None and p.way not in self.out.ways
+        }
         ends: dict[int, int] = {}
-        for piece in pieces:
-            if piece.way is not None and piece.way not in self.out.ways:
-                nodes = self.nodes.of(s.name, piece.nodes)
-                ends |= {piece.start: nodes[0], piece.stop: nodes[-1]}
-                turned = nodes[::-1] if backwards[piece.way] else nodes
-                self.out.ways[piece.way] = Way(turned, dict(named))
+        for k, way in whole.items():
+            piece = pieces[k]
+            nodes = self.nodes.of(s.name, piece.nodes)
+            ends |= {piece.start: nodes[0], piece.stop: nodes[-1]}
+            tags = own | ({ID_TAG: s.name} if given and k == longest else {})
+            self.out.ways[way] = Way(nodes[::-1] if backwards[way] else nodes, tags)
         for k, piece in enumerate(pieces):
-            if piece.start in ends and piece.stop in ends and piece.way is not None:
+            if k in whole:
                 continue
-            number, tags, name = first, named, s.name
-            if not same or first in self.out.ways:
+            name = s.name if given and k == longest else f"{s.name}/{k}"
+            number, tags = first, own | ({ID_TAG: s.name} if given else {})
+            alone = len(ways) == len(pieces) == 1 and first not in self.bounds_of_lanelets
+            if not alone or first in self.out.ways:
                 # The bounds of lanelets stay where they were; the line stands beside them.
-                name = f"{s.name}/{k}" if len(pieces) > 1 else s.name
                 number, tags = self.way_numbers.of(name), own | {ID_TAG: name}
                 self.notes["lines cut, added to or drawn anew, written as ways of their own"] += 1
             points = s.element.points[piece.start : piece.stop + 1]
             nodes = self.nodes.line(name, points, is_ring(points))
             nodes[0], nodes[-1] = ends.get(piece.start, nodes[0]), ends.get(piece.stop, nodes[-1])
-            self.out.ways[number] = Way(nodes, dict(tags))
+            self.out.ways[number] = Way(nodes, tags)
 
     def add_new(self, element: Element) -> None:
         """An element that Lanelet2 does not know yet."""
@@ -236,12 +242,12 @@ class _Writer:
         """A lanelet, area or other relation, with those of its bounds that are gone by now."""
         tags = own_tags(s.element.attributes)
         kind = tags.get("type") or "relation"
-        if s.name != f"{AREA if kind == 'multipolygon' else kind}-{number}":
-            tags[ID_TAG] = s.name
-        if relation_class(tags) != s.element.class_name:
-            tags[CLASS_TAG] = s.element.class_name
         if number in self.out.relations:
             number = self.relation_numbers.of(s.name)
+        if s.name != f"{AREA if kind == 'multipolygon' else kind}-{number}":
+            tags[ID_TAG] = s.name
+        if s.element.class_name not in (relation_class(tags), kind, "relation"):
+            tags[CLASS_TAG] = s.element.class_name
         members = list(s.members)
         if s.bounds and s.element.class_name in RING_CLASSES and not s.fits:
             members = self.reshaped(s, members)
@@ -281,8 +287,9 @@ class _Writer:
                 if len(kept) == len(relation.members):
                     continue
                 again = True
-                self.notes["members of relations whose element is gone left out"] += 1
-                if _needed(relation.members) <= _needed(kept):
+                lost = len(relation.members) - len(kept)
+                self.notes["members of relations whose element is gone left out"] += lost
+                if _means_something(relation.members, kept):
                     relation.members = kept
                 else:
                     del self.out.relations[number]
@@ -291,9 +298,12 @@ class _Writer:
             self.loose |= {m.ref for m in relation.members if m.kind == "node"}
 
 
-def _needed(members: Sequence[Member]) -> set[str]:
-    """The roles that a relation cannot be without."""
-    return {m.role for m in members} & {"left", "right", "outer", "refers"}
+def _means_something(before: Sequence[Member], after: Sequence[Member]) -> bool:
+    """True for a relation that can be without the members it lost: it has all its bounds, and
+    something that it refers to if it had."""
+    a, b = Counter(m.role for m in before), Counter(m.role for m in after)
+    bounds = all(a[role] == b[role] for role in ("left", "right", "outer"))
+    return bounds and bool(b["refers"]) == bool(a["refers"])
 
 
 def _way_tags(element: Element) -> Tags:
