@@ -32,12 +32,16 @@ COMMANDS: dict[str, Any] = {
             "av2": ("import_av2", "The vector map of an Argoverse 2 log becomes a map."),
             "nuscenes": ("import_nuscenes", "A vector map of nuScenes becomes a map."),
             "geojson": ("import_geojson", "A GeoJSON file becomes a map."),
+            "lanelet2": ("import_lanelet2", "A Lanelet2 map becomes a map."),
             "detections": ("import_detections", "Detections of any model become a run."),
         },
     ),
     "export": (
         "Write maps in other formats.",
-        {"geojson": ("export_geojson", "A map as GeoJSON in WGS84.")},
+        {
+            "geojson": ("export_geojson", "A map as GeoJSON in WGS84."),
+            "lanelet2": ("export_lanelet2", "A map as a Lanelet2 file."),
+        },
     ),
     "simulate": (
         "Make towns, drives, images, observations and changes.",

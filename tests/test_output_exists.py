@@ -18,8 +18,10 @@ WRITERS: dict[str, list[str]] = {
     "import av2": [NOWHERE],
     "import nuscenes": [NOWHERE],
     "import geojson": [NOWHERE],
+    "import lanelet2": [NOWHERE],
     "import detections": [NOWHERE],
     "export geojson": [NOWHERE],
+    "export lanelet2": [NOWHERE],
     "simulate town": ["--size", "150"],
     "simulate changes": ["--map", NOWHERE, "--change", "delete:divider"],
     "simulate degrade": ["--map", NOWHERE],
@@ -36,7 +38,15 @@ WRITERS: dict[str, list[str]] = {
 PLOTTERS = {"evaluate uncertainty": [NOWHERE, "--poses", NOWHERE, "--plot"]}
 """Verbs whose only file is a picture that one may ask for; alike, up to the picture's path."""
 
-FILES = ("detect-changes", "export geojson", "map diff", "picture", "train", "export-model")
+FILES = (
+    "detect-changes",
+    "export geojson",
+    "export lanelet2",
+    "map diff",
+    "picture",
+    "train",
+    "export-model",
+)
 
 
 def _leaves(table: dict[str, Any], before: str = "") -> Iterator[tuple[str, click.Command]]:

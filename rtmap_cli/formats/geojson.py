@@ -57,7 +57,7 @@ def read_geojson(path: str | Path, crs: str | None = None) -> VectorMap:
     flat = [part for group in parts for part in group]
     lonlat = np.concatenate([p.lonlat for p in flat]) if flat else np.zeros((0, 3))
     crs = check_map_crs(crs or source or _zone_of(lonlat, path))
-    _check_area(crs, lonlat, path)
+    check_area(crs, lonlat, path)
     xyz = np.column_stack([lonlat_to(crs, lonlat[:, :2]), lonlat[:, 2]])
     elements: list[Element] = []
     used = 0
@@ -99,7 +99,7 @@ def _zone_of(lonlat: Array, path: str | Path) -> str:
     return utm_crs(float(middle[0]), float(middle[1]))
 
 
-def _check_area(crs: str, lonlat: Array, path: str | Path, margin: float = 6.0) -> None:
+def check_area(crs: str, lonlat: Array, path: str | Path, margin: float = 6.0) -> None:
     """BadInput when data lie so far outside the CRS's area of use that metres are none."""
     area = parse_crs(crs).area_of_use
     if area is None or not len(lonlat) or area.west > area.east:
