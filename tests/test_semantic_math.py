@@ -13,8 +13,8 @@ from semantic_samples import ribbon_rig
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, transform
 from rtmap_cli.logs.log import Camera, Frame
-from rtmap_cli.logs.sensor_times import ego_at
 from rtmap_cli.logs.semantic import CLASSES, Window
+from rtmap_cli.logs.sensor_times import ego_at
 from rtmap_cli.steps.semantic.evidence import CONFUSION, Weighting
 from rtmap_cli.steps.semantic.ground import split
 from rtmap_cli.steps.semantic.labels import IGNORE, read_labels

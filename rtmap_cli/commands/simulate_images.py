@@ -76,6 +76,13 @@ POSITIVE = options.FiniteRange(0, min_open=True)
 )
 @click.option("--masks", is_flag=True, help="Label masks of every image as well.")
 @click.option(
+    "--mask-errors",
+    type=options.FiniteRange(0, 0.5),
+    default=0.0,
+    show_default=True,
+    help="Share of the masks that is wrong: borders off, paint missed.",
+)
+@click.option(
     "--camera-delay",
     "delay",
     type=options.FiniteRange(0, 1),
@@ -126,6 +133,7 @@ def command(
     traffic: str | None,
     lidar: str | None,
     masks: bool,
+    mask_errors: float,
     delay: float,
     specs: tuple[str, ...],
     output: Path,
@@ -178,9 +186,9 @@ def command(
     }  # fmt: skip
     if in_town:
         said |= {"route": route, "length": length, "spacing": way.spacing}
-    senses = Senses(lidar, masks, delay)
+    senses = Senses(lidar, masks, delay, mask_errors)
     if senses != Senses():
-        said |= {"lidar": lidar, "masks": masks, "camera_delay": delay}
+        said |= {"lidar": lidar, "masks": masks, "camera_delay": delay, "mask_errors": mask_errors}
     with whole_folder(output, overwrite) as folder:
         count = _write(
             folder, source, path, rig, key, (vector_map, world_map, truth), traffic, quality,
@@ -270,7 +278,9 @@ def _write(
     pictures = images_of(world, seen, rig, source, key, quality)
     shown = progress(pictures, "frames", len(path), quiet)
     sweeps = sweeps_of(ground, path, source, key, senses.lidar) if senses.lidar else repeat(None)
-    masks = masks_of(ground, seen, rig, source, key) if senses.masks else repeat(None)
+    masks = (
+        masks_of(ground, seen, rig, source, key, senses.errors) if senses.masks else repeat(None)
+    )
     for k, (frame, images) in enumerate(zip(frames_of(path, key), shown, strict=True)):
         times = dict.fromkeys(images, int(seen.timestamp_ns[k]))
         writer.add(frame, images, times, next(sweeps), next(masks))

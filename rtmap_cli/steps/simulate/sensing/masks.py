@@ -6,20 +6,26 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from rtmap_cli.geometry.poses import transform
 from rtmap_cli.logs.log import Camera
 from rtmap_cli.steps.simulate.images.render import lattice_rays, optics_of, pixel_rays
 from rtmap_cli.steps.simulate.images.render_boxes import FACES, clip_near, corners_of, project
 from rtmap_cli.steps.simulate.sensing.ground_labels import (
+    CROSSWALK,
+    CURB,
+    MARKING,
     PAINTED,
+    ROAD,
+    SIDEWALK,
     SKY,
     TERRAIN,
     GroundLabels,
 )
 from rtmap_cli.steps.simulate.sensing.scene import Scene
 from rtmap_cli.steps.simulate.worlds.roadside import CROWN
-from rtmap_cli.steps.simulate.worlds.world_ground import opencv
+from rtmap_cli.steps.simulate.worlds.world_ground import noise_fields, opencv
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.uint8]
@@ -52,6 +58,30 @@ def draw_mask(ground: GroundLabels, scene: Scene, camera: Camera) -> Mask:
         if box[6] - box[5] >= FLAT:
             _draw(cv2, mask, camera, pose, box, int(kind))
     return mask
+
+
+def spoil(mask: Mask, share: float, rng: np.random.Generator) -> Mask:
+    """A mask (H, W) as a network might have drawn it: borders off by about 8 · ``share`` pixels,
+    paint, crossings and kerbs taken for road in patches that cover ``share`` of the image,
+    sidewalk for road and verge for sidewalk in patches half as frequent."""
+    fields = noise_fields()
+    height, width = mask.shape
+
+    def field(layer: int) -> NDArray[np.float32]:
+        i, j = rng.integers(0, len(fields), 2)
+        rows = (np.arange(height) + i) % len(fields)
+        columns = (np.arange(width) + j) % len(fields)
+        return fields[rows[:, None], columns, layer]
+
+    off = 8 * share
+    row = np.arange(height)[:, None] + np.round(off * field(1)).astype(int)
+    column = np.arange(width)[None, :] + np.round(off * field(1)).astype(int)
+    out = mask[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    missed, mixed = field(2) < norm.ppf(share), field(2) < norm.ppf(share / 2)
+    out[missed & np.isin(out, (MARKING, CROSSWALK, CURB))] = ROAD
+    out[mixed & (out == SIDEWALK)] = ROAD
+    out[mixed & (out == TERRAIN)] = SIDEWALK
+    return out
 
 
 def _draw(cv2: Any, mask: Mask, camera: Camera, pose: Array, box: Array, label: int) -> None:

@@ -18,7 +18,7 @@ from rtmap_cli.steps.simulate.perceiving.noise import generator
 from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
 from rtmap_cli.steps.simulate.sensing.ground_labels import LABELS, GroundLabels
 from rtmap_cli.steps.simulate.sensing.lidar import LIDARS, sweep
-from rtmap_cli.steps.simulate.sensing.masks import draw_mask
+from rtmap_cli.steps.simulate.sensing.masks import draw_mask, spoil
 from rtmap_cli.steps.simulate.sensing.scene import scene_at
 from rtmap_cli.steps.simulate.worlds.world_ground import opencv
 
@@ -31,12 +31,14 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Senses:
     """What a vehicle records besides images: ``lidar`` (a key of `LIDARS` or None), ``masks`` of
-    its cameras; they expose ``delay`` seconds after the sweep, which is taken at the frame's time.
+    its cameras, a share ``errors`` of them wrong (see `spoil`); cameras expose ``delay`` seconds
+    after the sweep, which is taken at the frame's time.
     """
 
     lidar: str | None = None
     masks: bool = False
     delay: float = 0.0
+    errors: float = 0.0
 
 
 def label_list() -> dict[str, list[dict[str, str]]]:
@@ -84,7 +86,7 @@ def sweeps_of(
 
 
 def masks_of(
-    ground: GroundLabels, path: Drive, rig: Rig, source: Source, key: DriveKey
+    ground: GroundLabels, path: Drive, rig: Rig, source: Source, key: DriveKey, errors: float
 ) -> Iterator[dict[str, bytes]]:
     """PNG files of every frame by camera name; ``path`` is where the cameras expose."""
     cv2 = opencv()
@@ -94,4 +96,7 @@ def masks_of(
             ground.world, source, pose, path.occluders[k] if path.occluders else (), style
         )
         masks = {camera.name: draw_mask(ground, scene, camera) for camera in rig}
+        if errors:
+            rng = generator(*key.drive, "masks", k)
+            masks = {name: spoil(mask, errors, rng) for name, mask in masks.items()}
         yield {name: cv2.imencode(".png", mask)[1].tobytes() for name, mask in masks.items()}
