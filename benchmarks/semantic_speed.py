@@ -11,7 +11,7 @@ window apart. Peers, doing the same but without the test for hidden points:
 
 * numpy/OpenCV: cv2.projectPoints per camera on all points, a dictionary-free np.add.at into a dense
   raster of log-likelihoods;
-* per point: a plain Python loop over points and cameras (on every 40th point, scaled up).
+* per point: a plain Python loop over points and cameras (on every 120th point, scaled up).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from rtmap_cli.steps.semantic.raster import Raster
 Array = NDArray[np.float64]
 
 REACH, CELL = 40.0, 0.2
-PART = 40
+PART = 120
 """The loop over points sees every so manieth point."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -231,6 +232,20 @@ def test_windows_turn_with_the_vehicle(yaw: float, x: float, y: float) -> None:
     assert abs(row.mean() - (2.1 + 6.0) / 0.2 + 0.5) < 0.6 and np.ptp(row) <= 3
     assert column.min() <= 7 and column.max() >= 112
     assert (planes[:-1].argmax(axis=0)[planes[-1] > 100] == MARKING).all()
+
+
+def test_a_sweep_is_fused_in_the_time_that_a_vehicle_has() -> None:
+    """Processor time of one core, so that a busy machine does not count; with a margin of two."""
+    pytest.importorskip("cv2")
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+    try:
+        from semantic_speed import measure
+    finally:
+        sys.path.pop(0)
+    six, vlp16 = measure(rounds=3)
+    assert six["ms"] < 50 and vlp16["ms"] + vlp16["window_ms"] < 50
+    assert six["opencv_ratio"] > 2 and six["loop_ratio"] > 10
+    assert min(six["points_of_the_ground"], vlp16["points_of_the_ground"]) > 2_000
 
 
 def test_label_lists_of_mapillary_and_cityscapes(tmp_path: Path) -> None:
