@@ -64,6 +64,7 @@ COMMANDS: dict[str, Any] = {
             "gc": ("map_gc", "Remove files that no kept version needs."),
         },
     ),
+    "semantic-map": ("semantic_map", "Masks and LiDAR of a log become a raster of the ground."),
     "check-log": ("check_log", "Name what is wrong with a log."),
     "picture": ("picture", "The cameras of a frame with lines drawn on the road."),
     "train": ("train", "Train the network (extra: train)."),

@@ -100,8 +100,13 @@ def whole_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
             shutil.rmtree(temporary)
 
 
-MARKERS = {"run.json": "a run", "log.json": "a log", "_delta_log": "a map"}
-"""What tells a run, a log and a map from any other folder."""
+MARKERS = {
+    "run.json": "a run",
+    "log.json": "a log",
+    "semantic.json": "a semantic map",
+    "_delta_log": "a map",
+}
+"""What tells a run, a log, a semantic map and a map from any other folder."""
 
 
 def taken_for(folder: Path) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 from rtmap_cli.formats.changes import CHANGES_SCHEMA, CHANGES_VERSION, KINDS
 from rtmap_cli.formats.geojson import GEOJSON_SCHEMA, GEOJSON_VERSION
 from rtmap_cli.logs.run import RUN_SCHEMA, RUN_VERSION
+from rtmap_cli.logs.semantic import CLASSES, SEMANTIC_SCHEMA, SEMANTIC_VERSION
 from rtmap_cli.logs.tables import LOG_SCHEMA, LOG_VERSION
 from rtmap_cli.maps.delta import MAP_FORMAT, MAP_VERSION
 from rtmap_cli.maps.footprint import ORIGINS, PREFIX, ZOOM
@@ -104,6 +105,45 @@ def _log() -> Node:
     return _document(
         LOG_SCHEMA, "LOG/log.json", _object(properties, required, "What a native log is.")
     )
+
+
+def _semantic() -> Node:
+    window = {
+        "half_x": _number("half the length of the ego window, m"),
+        "half_y": _number("half its width, m"),
+        "cell": _number("size of a cell, m"),
+        "rows": _integer("cells from right to left"),
+        "columns": _integer("cells from rear to front"),
+        "planes": _texts("planes of a raster from top to bottom: the classes, then evidence"),
+        "layout": _text("where which cell lies in the PNG files"),
+        "values": _text("what the values of the planes mean"),
+    }
+    properties = _versioned(SEMANTIC_SCHEMA, SEMANTIC_VERSION) | {
+        "log_id": _text("identity of the drive"),
+        "crs": _text("CRS of its poses and cells"),
+        "classes": _texts("classes of the ground, in the order of the planes"),
+        "colours": {"type": "object", "description": "red, green, blue of each class in pictures"},
+        "cell": _number("size of a cell of the map, m"),
+        "window": _object(window, list(window), "the rasters of frames"),
+        "creation": {"type": "object", "description": "who made it and how"},
+    }
+    about = "What a semantic map is."
+    node = _object(properties, list(properties), about)
+    return _document(SEMANTIC_SCHEMA, "SEMANTIC/semantic.json", node)
+
+
+def _labels() -> Node:
+    label = _object(
+        {
+            "name": _text("name of the label; its place in the list is the number in masks"),
+            "class": {"enum": [*CLASSES, "ignore"], "description": "what it means for the ground"},
+        },
+        ["name"],
+    )
+    entry = {"type": "array", "items": label, "description": "labels from number 0 on"}
+    network = {"type": "object", "description": "mean, std, size of a network's input"}
+    node = _object({"labels": entry, "input": network}, ["labels"], "What masks mean.")
+    return _document("rtmap.labels", "LOG/masks/labels.json", node)
 
 
 def _geometry(*kinds: str) -> Node:
@@ -221,5 +261,13 @@ def _map_properties() -> Node:
 
 def documents() -> dict[str, Node]:
     """Schema name → JSON Schema."""
-    found = [_run(), _log(), _map_geojson(), _changes_geojson(), _map_properties()]
+    found = [
+        _run(),
+        _log(),
+        _semantic(),
+        _labels(),
+        _map_geojson(),
+        _changes_geojson(),
+        _map_properties(),
+    ]
     return {node["title"]: node for node in found}

@@ -146,6 +146,25 @@ TABLES = {
         "z": "up, m",
         "intensity": "0 to 1",
     },
+    "rtmap.semantic.windows": VEHICLE_POSE
+    | {
+        "points": "points of the ground with a class that the frame gave",
+        "path": "the raster, relative to the folder of the semantic map",
+    },
+    "rtmap.semantic.cells": {
+        "x": "centre of the cell, east, m",
+        "y": "centre of the cell, north, m",
+        "z": "weighted mean height of the points in it, m",
+        "class_name": "the likeliest class: road, crosswalk, marking, curb, sidewalk or terrain",
+        "p_road": "probability of road",
+        "p_crosswalk": "probability of crosswalk",
+        "p_marking": "probability of marking",
+        "p_curb": "probability of curb",
+        "p_sidewalk": "probability of sidewalk",
+        "p_terrain": "probability of terrain",
+        "weight": "summed weight of all observations of the cell",
+        "frames": "frames that saw it",
+    },
 }
 
 FILES = {
@@ -161,4 +180,6 @@ FILES = {
     "rtmap.log.images": "LOG/images.parquet",
     "rtmap.log.lidar": "LOG/lidar.parquet",
     "rtmap.log.sweep": "LOG/lidar/<frame>.parquet",
+    "rtmap.semantic.windows": "SEMANTIC/windows.parquet",
+    "rtmap.semantic.cells": "SEMANTIC/cells.parquet",
 }

@@ -27,6 +27,7 @@ WRITERS: dict[str, list[str]] = {
     "simulate degrade": ["--map", NOWHERE],
     "simulate images": ["--map", NOWHERE, "--log", "town:"],
     "simulate observations": ["--map", NOWHERE, "--log", "town:"],
+    "semantic-map": [NOWHERE],
     "map diff": [NOWHERE, "0", "1"],
     "picture": [NOWHERE],
     "train": ["--frames", "1", "--steps", "1"],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from rtmap_cli.steps.simulate.driving.drive_source import Source
     from rtmap_cli.steps.simulate.driving.drives import Drive
     from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+    from rtmap_cli.steps.simulate.sensing.senses import Senses
 
 LOG_RATE, TOWN_SPACING = 2.0, 2.5
 POSITIVE = options.FiniteRange(0, min_open=True)
@@ -65,9 +67,28 @@ POSITIVE = options.FiniteRange(0, min_open=True)
 @click.option(
     "--rig",
     "rig_name",
-    type=click.Choice(["log", "default"]),
+    type=click.Choice(["log", "default", "campus"]),
     default=None,
-    help="The log's calibration or a default ring of seven cameras [default: log].",
+    help="The log's calibration, a default ring of seven cameras or a cart's two [default: log].",
+)
+@click.option(
+    "--lidar", type=click.Choice(["vlp16", "hdl32", "os64"]), help="Sweeps of such a LiDAR as well."
+)
+@click.option("--masks", is_flag=True, help="Label masks of every image as well.")
+@click.option(
+    "--mask-errors",
+    type=options.FiniteRange(0, 0.5),
+    default=0.0,
+    show_default=True,
+    help="Share of the masks that is wrong: borders off, paint missed.",
+)
+@click.option(
+    "--camera-delay",
+    "delay",
+    type=options.FiniteRange(0, 1),
+    default=0.0,
+    show_default=True,
+    help="Cameras expose so long after the frame's time, which is the LiDAR's (s).",
 )
 @click.option(
     "--width",
@@ -110,6 +131,10 @@ def command(
     width: int,
     quality: int,
     traffic: str | None,
+    lidar: str | None,
+    masks: bool,
+    mask_errors: float,
+    delay: float,
     specs: tuple[str, ...],
     output: Path,
     overwrite: bool,
@@ -130,6 +155,7 @@ def command(
     from rtmap_cli.steps.simulate.driving.drive import first_frames
     from rtmap_cli.steps.simulate.driving.drive_source import TOWN, Route, find_source
     from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+    from rtmap_cli.steps.simulate.sensing.senses import Senses
     from rtmap_cli.steps.simulate.worlds.changes import parse_spec
     from rtmap_cli.tables import refuse_existing, refuse_over, whole_folder
 
@@ -160,16 +186,20 @@ def command(
     }  # fmt: skip
     if in_town:
         said |= {"route": route, "length": length, "spacing": way.spacing}
+    senses = Senses(lidar, masks, delay, mask_errors)
+    if senses != Senses():
+        said |= {"lidar": lidar, "masks": masks, "camera_delay": delay, "mask_errors": mask_errors}
     with whole_folder(output, overwrite) as folder:
         count = _write(
             folder, source, path, rig, key, (vector_map, world_map, truth), traffic, quality,
-            said, quiet,
+            said, senses, quiet,
         )  # fmt: skip
     result = {
         "log": str(output), "frames": len(path), "images": count, "cameras": len(rig),
         "changes": [] if truth is None else truth["changes"],
     }  # fmt: skip
     told = f"{output}: {len(path)} frames, {count} images of {len(rig)} cameras"
+    told += "".join(f", {n}" for n, given in (("sweeps", lidar), ("masks", masks)) if given)
     emit(result, as_json, [told + "; truth in truth/"])
 
 
@@ -177,8 +207,10 @@ def _rig(source: Source, name: str | None, width: int, log_path: str) -> Rig:
     """The cameras at the wanted width."""
     from rtmap_cli.errors import BadInput
     from rtmap_cli.logs.log import Rig
-    from rtmap_cli.steps.simulate.images.rig import default_rig, scale_camera
+    from rtmap_cli.steps.simulate.images.rig import campus_rig, default_rig, scale_camera
 
+    if name == "campus":
+        return campus_rig(width, round(width * 0.66), source.ground_z)
     if name != "default" and source.rig is not None:
         for camera in source.rig:
             if camera.model != "pinhole" or len(camera.distortion) != 3 or any(camera.tangential):
@@ -220,6 +252,7 @@ def _write(
     traffic: str | None,
     quality: int,
     said: dict[str, Any],
+    senses: Senses,
     quiet: bool,
 ) -> int:
     """Render every frame into the folder; returns the number of images."""
@@ -231,17 +264,28 @@ def _write(
         poses_of,
         with_vehicles,
     )
+    from rtmap_cli.steps.simulate.sensing.ground_labels import GroundLabels
+    from rtmap_cli.steps.simulate.sensing.senses import exposed, label_list, masks_of, sweeps_of
     from rtmap_cli.steps.simulate.worlds.world import world_from_map
+    from rtmap_cli.tables import write_json
 
     vector_map, world_map, truth = maps
     world = world_from_map(world_map, key.world_seed, surface_map=vector_map if truth else None)
     path = on_springs(with_vehicles(path, source, world.surface, key, traffic), source, key)
     name = f"{path.name}-images-w{key.world_seed}-s{key.seed}-d{key.traversal}"
     writer = NativeLogWriter(folder, name, path.crs, rig, source.ground_z, creation=said)
-    pictures = images_of(world, path, rig, source, key, quality)
+    seen, ground = exposed(path, senses.delay), GroundLabels(world)
+    pictures = images_of(world, seen, rig, source, key, quality)
     shown = progress(pictures, "frames", len(path), quiet)
-    for frame, images in zip(frames_of(path, key), shown, strict=True):
-        writer.add(frame, images)
+    sweeps = sweeps_of(ground, path, source, key, senses.lidar) if senses.lidar else repeat(None)
+    masks = (
+        masks_of(ground, seen, rig, source, key, senses.errors) if senses.masks else repeat(None)
+    )
+    for k, (frame, images) in enumerate(zip(frames_of(path, key), shown, strict=True)):
+        times = dict.fromkeys(images, int(seen.timestamp_ns[k]))
+        writer.add(frame, images, times, next(sweeps), next(masks))
+    if senses.masks:
+        write_json(label_list(), folder / "masks" / "labels.json")
     writer.write_truth(poses_of(path), truth)
     writer.close()
     if not path.occluders and traffic != "none" and not quiet:

@@ -179,6 +179,7 @@ class DgpLog(FrameLog):
             images={n: files[n] for n in cameras},
             lidar=files[first] if sweeps else None,
             ego_SE3_exposure={n: invert(here) @ poses[n] for n in cameras},
+            image_time_ns={n: self._time(found[n]) for n in cameras},
         )
 
     def _time(self, datum: Any) -> int:

@@ -52,6 +52,7 @@ def check_native(folder: Path, fast: bool = False) -> Report:
     times = _check_frames(report, frames, crs) if frames is not None else None
     _check_images(report, rig, times, fast)
     _check_lidar(report, times)
+    _check_masks(report, rig, fast)
     _check_occluders(report, times)
     _check_truth(report, times)
     return report
@@ -218,6 +219,25 @@ def _check_lidar(report: Report, times: dict[int, int] | None) -> None:
             report.warning(
                 report.folder / name, "points lie hundreds of metres away", "use the ego frame"
             )
+
+
+def _check_masks(report: Report, rig: Rig | None, fast: bool) -> None:
+    folder = report.folder / "masks"
+    if not folder.is_dir():
+        return
+    if not (folder / "labels.json").exists():
+        report.error(folder, "has no labels.json", "say what the numbers in the masks mean")
+    cameras = {c.name: c for c in rig or ()}
+    limited = Limited(report)
+    for path in sorted(folder.glob("*/*.png")):
+        name = path.parent.name
+        if rig and name not in cameras:
+            limited.add("masks of unknown cameras", "error", path, f"{name} is not in rig.parquet")
+            continue
+        found = check_image(path, cameras.get(name), fast)
+        if found is not None:
+            limited.add(f"masks: {found[0]}", "error", path, found[1], found[2])
+    limited.close(folder)
 
 
 def _check_occluders(report: Report, times: dict[int, int] | None) -> None:

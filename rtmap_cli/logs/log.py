@@ -91,6 +91,9 @@ class Frame:
     ``images`` maps camera names to files, ``lidar`` names a sweep or is None. Where the vehicle
     moved between an image and the frame, ``ego_SE3_exposure`` (4, 4) of that camera takes the ego
     frame at its exposure to the ego frame of this frame; a camera that is not in it exposed now.
+    ``image_time_ns`` and ``lidar_time_ns`` are the sensors' own times where the log states them;
+    readers whose poses are dense move sweeps and exposures to the frame themselves, for native
+    logs ``rtmap_cli.logs.sensor_times`` does.
     """
 
     index: int
@@ -103,6 +106,8 @@ class Frame:
     lidar: Path | None = None
     occluders: tuple[Occluder, ...] = ()
     ego_SE3_exposure: dict[str, Array] = field(default_factory=dict)
+    image_time_ns: dict[str, int] = field(default_factory=dict)
+    lidar_time_ns: int | None = None
 
 
 class Log(Protocol):

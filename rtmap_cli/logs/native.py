@@ -6,6 +6,7 @@ frames.parquet      initial poses T⁰ with sigmas, odometry
 images.parquet      which image belongs to which frame and camera
 images/<camera>/<frame>.jpg
 lidar.parquet, lidar/<frame>.parquet    sweeps (optional)
+masks/labels.json, masks/<camera>/<frame>.png   what each pixel shows (optional)
 occluders.parquet   boxes that hide something (optional)
 truth/poses.parquet, truth/changes.json what a simulator knows (optional, kept apart)
 """
@@ -123,6 +124,8 @@ class NativeLog:
         self.timestamp_ns = self._table["timestamp_ns"].to_numpy(zero_copy_only=False)
         self._check_frames()
         self.map_SE3_ego = poses_of_table(self._table, self._frames_file)
+        self._image_times: dict[int, dict[str, int]] = {}
+        self._sweep_times: dict[int, int] = {}
         self._images = self._read_images()
         self._sweeps = self._read_sweeps()
         self._occluders = self._read_occluders()
@@ -146,6 +149,8 @@ class NativeLog:
                 odometry_sigma=odometry_sigma[row] if known else None,
                 images=self._images.get(int(index), {}),
                 lidar=self._sweeps.get(int(index)),
+                image_time_ns=self._image_times.get(int(index), {}),
+                lidar_time_ns=self._sweep_times.get(int(index)),
                 occluders=tuple(self._occluders.get(int(index), ())),
             )
 
@@ -197,7 +202,7 @@ class NativeLog:
         if not path.exists():
             return out
         order = {c.name: k for k, c in enumerate(self.rig or ())}
-        rows = load(path, IMAGES).select(["frame", "camera", "path"]).to_pylist()
+        rows = load(path, IMAGES).to_pylist()
         if unknown := {row["camera"] for row in rows} - set(order):
             raise BadInput(
                 path, f"camera {min(unknown)} is not in rig.parquet", "add its calibration"
@@ -206,6 +211,7 @@ class NativeLog:
         files = paths_inside(self.path, [row["path"] for row in rows], path)
         for row, file in zip(rows, files, strict=True):
             out.setdefault(row["frame"], {})[row["camera"]] = file
+            self._image_times.setdefault(row["frame"], {})[row["camera"]] = row["timestamp_ns"]
         self._known_frames(out, path)
         return out
 
@@ -216,6 +222,7 @@ class NativeLog:
         rows = load(path, LIDAR).to_pylist()
         files = paths_inside(self.path, [row["path"] for row in rows], path)
         out = {row["frame"]: file for row, file in zip(rows, files, strict=True)}
+        self._sweep_times = {row["frame"]: row["timestamp_ns"] for row in rows}
         self._known_frames(out, path)
         return out
 
@@ -289,12 +296,15 @@ class NativeLogWriter:
         images: Mapping[str, bytes],
         image_times_ns: Mapping[str, int] | None = None,
         sweep: Array | None = None,
+        masks: Mapping[str, bytes] | None = None,
+        sweep_time_ns: int | None = None,
     ) -> None:
         """Add one frame with its JPEG files by camera name (any subset of the rig's cameras).
 
         ``image_times_ns`` gives exposure times where they differ from the frame's; ``sweep``
-        (n, 4) holds x, y, z in the ego frame and intensity. ``frame.images`` and ``frame.lidar``
-        are ignored. ValueError when frames do not rise or a camera is unknown.
+        (n, 4) holds x, y, z in the ego frame (of ``sweep_time_ns``, by default the frame's) and
+        intensity; ``masks`` are PNG files of label numbers by camera name. ``frame.images`` and
+        ``frame.lidar`` are ignored. ValueError when frames do not rise or a camera is unknown.
         """
         if self._rows and (
             frame.timestamp_ns <= self._rows[-1].timestamp_ns or frame.index <= self._rows[-1].index
@@ -310,11 +320,16 @@ class NativeLogWriter:
             path.write_bytes(data)
             time = (image_times_ns or {}).get(camera, frame.timestamp_ns)
             self._images.append((frame.index, camera, time, relative))
+        for camera, data in (masks or {}).items():
+            path = self.folder / "masks" / camera / f"{frame.index:06d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
         if sweep is not None:
             relative = f"lidar/{frame.index:06d}.parquet"
             columns = {n: sweep[:, k] for k, n in enumerate(SWEEP.columns.names)}
             write_table(pa.table(columns), self.folder / relative, SWEEP)
-            self._sweeps.append((frame.index, frame.timestamp_ns, relative))
+            time = frame.timestamp_ns if sweep_time_ns is None else sweep_time_ns
+            self._sweeps.append((frame.index, time, relative))
 
     def write_truth(self, poses: Poses, changes: Any | None = None) -> None:
         """Lay true poses (and changes, prior → world) apart, in ``truth/``."""

@@ -185,6 +185,7 @@ class Av2Log:
                 lidar=None if sweep is None else self.sweeps[sweep],
                 occluders=occluders_of(self.cuboids(time)),
                 ego_SE3_exposure=dict(zip(images, motion, strict=True)),
+                image_time_ns=dict(zip(images, exposed, strict=True)),
             )
 
     def _frame_times(self, rate_hz: float | None) -> Times:

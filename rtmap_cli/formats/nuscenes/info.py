@@ -86,7 +86,7 @@ class NuscenesInfoLog(FrameLog):
         ego_SE3_lidar = matrix_of(need(lidar, "lidar2ego", path, what), path, "lidar2ego")
         sweep = _file(path, str(need(lidar, "lidar_path", path, what)), "LIDAR_TOP")
         self._sweeps[index] = (int(lidar.get("num_pts_feats") or 5), ego_SE3_lidar)
-        images, motion = {}, {}
+        images, motion, times = {}, {}, {}
         for camera in rig or ():
             record = sample.get("images", {}).get(camera.name)
             if record is None or not record.get("img_path"):
@@ -97,6 +97,9 @@ class NuscenesInfoLog(FrameLog):
                 camera_SE3_lidar = matrix_of(record["lidar2cam"], path, f"lidar2cam of {what}")
                 exposure_SE3_ego = camera.ego_SE3_camera @ camera_SE3_lidar @ invert(ego_SE3_lidar)
                 motion[camera.name] = invert(exposure_SE3_ego)
+            if "timestamp" in record:
+                exposed = array(record["timestamp"], (), path, f"a timestamp of {what}")
+                times[camera.name] = round(float(exposed) * 1e6) * 1000
         seconds = float(array(sample["timestamp"], (), path, f"the timestamp of {what}"))
         return Frame(
             index=index,
@@ -106,6 +109,7 @@ class NuscenesInfoLog(FrameLog):
             images=images,
             lidar=sweep,
             ego_SE3_exposure=motion,
+            image_time_ns=times,
         )
 
 

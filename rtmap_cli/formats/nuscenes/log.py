@@ -88,7 +88,7 @@ class NuscenesLog(FrameLog):
         here = self._pose(data[lead])
         if LIDAR in data:
             self._sweeps[index] = self._extrinsics(data[LIDAR])
-        images, motion = {}, {}
+        images, motion, times = {}, {}, {}
         for channel, (calibration, _) in self._rig.items():
             record = data.get(channel)
             if record is None:
@@ -99,6 +99,7 @@ class NuscenesLog(FrameLog):
                 )
             images[channel] = self._file(record)
             motion[channel] = invert(here) @ self._pose(record)
+            times[channel] = self._microseconds(record) * 1000
         return Frame(
             index=index,
             timestamp_ns=self._microseconds(data[lead]) * 1000,
@@ -107,6 +108,7 @@ class NuscenesLog(FrameLog):
             images=images,
             lidar=self._file(data[LIDAR]) if LIDAR in data else None,
             ego_SE3_exposure=motion,
+            image_time_ns=times,
         )
 
     def _camera(self, channel: str, record: Record) -> tuple[str, Camera]:

@@ -89,6 +89,14 @@ def frames_of(path: Drive, key: DriveKey) -> Iterator[Frame]:
         )
 
 
+def lean_of(world: World, source: Source, pose: Array) -> Array:
+    """(4, 4) the level frame under a vehicle from its ego frame (see `images_of`)."""
+    lean = np.eye(4)
+    if world.ground is None and source.lanes is not None:
+        lean[:3, :3] = level(pose)[:3, :3].T @ pose[:3, :3]
+    return lean
+
+
 def images_of(
     world: World, path: Drive, rig: Rig, source: Source, key: DriveKey, quality: int
 ) -> Iterator[dict[str, bytes]]:
@@ -103,9 +111,7 @@ def images_of(
     for k, pose in enumerate(path.pose):
         boxes = path.occluders[k] if path.occluders else ()
         rng = generator(*key.drive, "camera", k)
-        lean = np.eye(4)
-        if world.ground is None and source.lanes is not None:
-            lean[:3, :3] = level(pose)[:3, :3].T @ pose[:3, :3]
+        lean = lean_of(world, source, pose)
         images = render_cameras(world, pose, rig.cameras, style, boxes, rng, source.ground_z, lean)
         yield {
             camera.name: cv2.imencode(".jpg", image[..., ::-1], parameters)[1].tobytes()

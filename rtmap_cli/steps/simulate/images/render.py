@@ -131,21 +131,21 @@ Optics = tuple[tuple[float, ...], tuple[float, ...]]
 """(fx, fy, cx, cy, skew) and distortion k1, k2, k3 of a camera."""
 
 
-def _optics(camera: Camera) -> Optics:
+def optics_of(camera: Camera) -> Optics:
     k = camera.intrinsics
     key = (k[0, 0], k[1, 1], k[0, 2], k[1, 2], k[0, 1])
     return tuple(float(v) for v in key), tuple(camera.distortion)
 
 
 @lru_cache(maxsize=64)
-def _rays(width: int, height: int, optics: Optics, rows: int) -> tuple[Floats, Floats]:
+def pixel_rays(width: int, height: int, optics: Optics, rows: int) -> tuple[Floats, Floats]:
     """Normalised image coordinates (x, y) of ``rows`` samples per image row, undistorted."""
     v = (np.arange(height * rows) + 0.5) / rows - 0.5
     return _undistorted(*np.meshgrid(np.arange(width), v), optics)
 
 
 @lru_cache(maxsize=64)
-def _lattice_rays(width: int, height: int, optics: Optics) -> tuple[Floats, Floats]:
+def lattice_rays(width: int, height: int, optics: Optics) -> tuple[Floats, Floats]:
     """Normalised image coordinates of the lattice on which hills are looked for."""
     return _undistorted(*lattice(width, height)[1:], optics)
 
@@ -181,15 +181,15 @@ def _ground_and_sky(
     ``ground``: hills, or the height of a plane in the frame of ``pose`` (m).
     """
     width, height = camera.width, camera.height
-    optics = _optics(camera)
+    optics = optics_of(camera)
     fx = optics[0][0]
     rows = 2 if fx < 420 else 1
-    rx, ry = _rays(width, height, optics, rows)
+    rx, ry = pixel_rays(width, height, optics, rows)
     r = pose[:3, :3].astype(np.float32)
     down = r[2, 0] * rx + r[2, 1] * ry + r[2, 2]
     slope = down
     if isinstance(ground, Terrain):
-        rays = _lattice_rays(width, height, optics)
+        rays = lattice_rays(width, height, optics)
         seen, lifted = ground.slant(cv2, width, height, rows, rays, pose)
         rise, down = np.float32(lifted), -seen
     else:

@@ -164,7 +164,7 @@ def _box(
         if uv is not None:
             _fill(cv2, image, uv[list(face)], colour)
             continue
-        polygon = _clip_near(local[list(face)])
+        polygon = clip_near(local[list(face)])
         if polygon is not None:
             _fill(cv2, image, project(camera, polygon), colour)
 
@@ -189,7 +189,7 @@ def _crown(
         cv2.circle(image, middle, round(radius * 16), colour.tolist(), -1, cv2.LINE_8, 4)
 
 
-def _clip_near(polygon: Array) -> Array | None:
+def clip_near(polygon: Array) -> Array | None:
     """The part of a camera-frame polygon beyond the near plane (Sutherland–Hodgman)."""
     depth = polygon[:, 2]
     if (depth >= NEAR).all():

@@ -48,6 +48,24 @@ def default_rig(
     return Rig(tuple(cameras))
 
 
+CAMPUS = (("front_left", 12.0, 0.95, 0.35), ("front_right", -12.0, 0.95, -0.35))
+"""Name, yaw (degrees), x and y of the two cameras of a campus cart (m); 75° wide, 1.9 m high."""
+
+
+def campus_rig(width: int = 512, height: int = 336, ground_z: float = 0.0) -> Rig:
+    """Two front cameras under the roof of a cart, horizon on 0.45 of the height; see `CAMPUS`."""
+    focal = width / (2 * np.tan(np.radians(37.5)))
+    intrinsics = np.array([[focal, 0, (width - 1) / 2], [0, focal, 0.45 * height], [0, 0, 1.0]])
+    cameras = []
+    for name, yaw, x, y in CAMPUS:
+        c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+        pose = np.eye(4)
+        pose[:3, 0], pose[:3, 1], pose[:3, 2] = (s, -c, 0), (0, 0, -1), (c, s, 0)
+        pose[:3, 3] = (x, y, 1.9 + ground_z)
+        cameras.append(Camera(name, width, height, intrinsics, pose))
+    return Rig(tuple(cameras))
+
+
 def jitter_rig(
     rig: Rig, rng: np.random.Generator, keep_horizon: bool = True, scale: float = 1.0
 ) -> Rig:

@@ -87,7 +87,7 @@ def _noise(x0: float, y0: float, step: float) -> NDArray[np.float32]:
     return np.stack(planes).reshape(5, TILE, TILE)
 
 
-def _layout(world: World) -> dict[str, Any]:
+def layout_of(world: World) -> dict[str, Any]:
     """Spatial indices of what is drawn on the ground; computed once per world."""
     if "curb" in world.boxes:
         return world.boxes
@@ -147,7 +147,7 @@ def ground_window(
 def draw_tile(world: World, x0: float, y0: float, step: float, level: int) -> Image:
     """One tile (2, 256, 256, 4) with its lower left corner at (x0, y0) in the map frame."""
     cv2 = opencv()
-    layout = _layout(world)
+    layout = layout_of(world)
     # Coverage comes from finer pixels (OpenCV's own anti-aliasing widens every polygon), one row
     # and column of them more on each side, because filling is inexact along the border.
     fine = 4 if level < 2 else 8
