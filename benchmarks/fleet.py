@@ -45,6 +45,8 @@ MAPS = ("7fab2350", "adcf7d18", "3bffdcff")
 SCENARIOS = ("straight", "turning")
 REAL = "real_change"
 RANGE = PROTOCOLS["rtmap"].range_m
+SIGMAS_90 = 1.6449
+"""Half width of the 90 % interval of a Gaussian, in standard deviations."""
 EVERY = 4
 """Fused maps are judged at every fourth frame, as the benchmark asks."""
 
@@ -159,6 +161,37 @@ def fusion(scenario: Scenario, options: argparse.Namespace) -> dict[str, Any]:
     return scores
 
 
+def fusion_rows(scenario: Scenario, options: argparse.Namespace) -> dict[str, Any]:
+    """The rows of the benchmark over cycles, with U and without: the first n drives at once, into a
+    new map (``first`` at their initial poses, ``localized`` on the prior) or the prior itself."""
+    scenario.import_prior()
+    rows: dict[str, Any] = {}
+    for row in ("first", "localized", "maintenance"):
+        runs = scenario.work / ("raw" if row == "first" else "placed")
+        for more in ((), ("--without-sigma",)):
+            scores, target = {}, scenario.work / "map"
+            for n in range(1, max(options.cycles) + 1):
+                if not (runs / f"{n - 1:02d}").exists():
+                    run = scenario.import_run(n - 1, runs)
+                    if row != "first":
+                        scenario.command(
+                            "localize", run, "--map", scenario.prior, *options.localize
+                        )
+            for n in options.cycles:
+                some = scenario.work / "some"
+                shutil.rmtree(some, ignore_errors=True)
+                some.mkdir()
+                for k in range(n):
+                    (some / f"{k:02d}").symlink_to(runs / f"{k:02d}")
+                shutil.rmtree(target, ignore_errors=True)
+                if row == "maintenance":
+                    shutil.copytree(scenario.prior, target)
+                scenario.command("crowdsource", some, "--map", target, *more, *options.crowdsource)
+                scores[str(n)] = judge_map(scenario, read_map(target), n)
+            rows[row + (", without U" if more else "")] = scores
+    return rows
+
+
 def fused_maps(scenario: Scenario, options: argparse.Namespace) -> Iterator[tuple[int, VectorMap]]:
     """The map after each cycle that is asked for."""
     runs, target = scenario.work / "runs", scenario.work / "map"
@@ -194,9 +227,11 @@ def judge_map(scenario: Scenario, fused: VectorMap, count: int) -> dict[str, Any
             settings = Settings(thresholds=thresholds, every=EVERY, cell=cell)
             out[where + kind] = by_class(compare(fused, truth, drives, settings))
     cover = coverage(fused, truth, region, names)
+    sigma = honesty(fused, truth, region, names)
+    inside = float((sigma.ratio <= SIGMAS_90).mean()) if len(sigma.ratio) else 0.0
     return out | {
         "coverage": {name: c.as_json() for name, c in cover.items()},
-        "sigma": honesty(fused, truth, region, names).as_json(),
+        "sigma": sigma.as_json() | {"inside_90": inside},
     }
 
 

@@ -28,7 +28,8 @@ from pathlib import Path
 from typing import Any
 
 import fleet
-from fleet_print import figures, pose_tables, verdicts
+from fleet_maps import PRINT, printed
+from fleet_print import Verdict, figures, pose_tables, verdicts
 
 import rtmap_cli
 from rtmap_cli.logs.run import read_run
@@ -137,7 +138,8 @@ def whole(scenario: fleet.Scenario, unit: Unit, golden: Path) -> dict[str, Any]:
     """One of the other parts over all drives of a scenario."""
     options = fleet.parse([unit.part, "--golden", str(golden)])
     options.localize = [*MODES[unit.mode], *unit.options]
-    return {"figures": fleet.TESTS[unit.part][0](scenario, options)}
+    measure_ = fleet.fusion_rows if unit.part == "fusion" else fleet.TESTS[unit.part][0]
+    return {"figures": measure_(scenario, options)}
 
 
 def measured(
@@ -206,7 +208,8 @@ def main(arguments: list[str] | None = None) -> int:
     for n, (unit, result) in enumerate(measured(units, options), start=1):
         results.setdefault(unit.part, []).append((unit, result))
         print(f"{n}/{len(units)} {unit.part} {unit.name}", file=sys.stderr, flush=True)
-    judged, kept = [], {}
+    judged: list[Verdict] = []
+    kept: dict[str, Any] = {}
     for part in [p for p in PARTS if p in results]:
         found = sorted(results[part], key=lambda r: r[0].name)
         print(f"## {part}\n")
@@ -214,10 +217,15 @@ def main(arguments: list[str] | None = None) -> int:
             scores = scores_of(found)
             kept[part] = {"/".join(k): v for k, v in scores.items()}
             print("\n".join(pose_tables(scores)))
-            judged = verdicts(scores)
+            judged += verdicts(scores)
         else:
             kept[part] = {u.scenario: r["figures"] for u, r in found}
-            print("\n".join([*fleet.TESTS[part][1](kept[part]), ""]))
+            if part in PRINT:
+                lines, more = printed(part, kept[part])
+                judged += more
+            else:
+                lines = fleet.TESTS[part][1](kept[part])
+            print("\n".join([*lines, ""]))
         spent = sum(r["seconds"].get("localize", 0.0) for _, r in found)
         print(f"localize took {spent:.0f} s, all {sum(r['cpu_s'] for _, r in found):.0f} CPU s\n")
     print("\n".join(v.line for v in judged))
