@@ -97,7 +97,8 @@ def _lines(
     policy, now_ns = settings.policy, newest_ns(traversals)
     old = [e.xy for e in prior]
     known = stations_of(old)
-    samples = [registered(class_samples(t, name), known) for t in traversals]
+    seen = [class_samples(t, name) for t in traversals]
+    samples = [registered(s, known) for s in seen]
     sigma = [offset_sigma(known, s) for s in samples]
     feet = [assign_once(known, s)[0] for s in samples]
     sight = sight_of(known, traversals, samples, feet, policy.view_margin_m)
@@ -120,7 +121,8 @@ def _lines(
         found = _supported(found, len(old), stations, votes, policy)
         found = joined_lines(found, name)
     out = [_line_evidence(e, k, stations, votes, settings, now_ns) for k, e in enumerate(prior)]
-    _add_offsets(out, stations, traversals, samples, fresh, settings)
+    # Where a line of the map lies is told by what was seen, not by what the map made of it.
+    _add_offsets(out, stations, traversals, seen, fresh, settings)
     for k, line in enumerate(found):
         element = Element(new_id(name, line), name, line)
         out.append(
