@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.poses import wrap_angle, xyyaw_of
 from rtmap_cli.logs.motion import Motion, MotionModel, motion_of
 from rtmap_cli.logs.run import OUTDATED, Run
+from rtmap_cli.maps.outlook import Outlook, outlook
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -68,6 +70,11 @@ class Traversal:
     def kilometres(self) -> float:
         """Distance driven between its frames."""
         return float(np.hypot(*np.diff(self.pose[:, :2], axis=0).T).sum()) / 1000
+
+    @cached_property
+    def outlook(self) -> Outlook:
+        """What its frames could see."""
+        return outlook(self.pose, self.range_m, self.occluders)
 
     def moved(self, pose: Array, pose_covariance: Array) -> Traversal:
         """The drive at other poses (m, 3) with other covariances (m, 3, 3), and what it saw."""

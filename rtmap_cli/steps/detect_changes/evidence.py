@@ -151,7 +151,8 @@ def _line_votes(
     doubtful = questioned(votes, pairs, before)
     some = np.flatnonzero(fresh)
     for asked, rows in ((picked, np.arange(len(fresh))), (doubtful, some)):
-        if asked.any() and len(rows):
+        # When all choose last they choose as they did.
+        if asked.any() and len(rows) and not (asked | picked).all():
             without = all_line_counts(*drives, first=~(asked | picked))
             votes = weighed(
                 votes,
