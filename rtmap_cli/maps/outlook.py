@@ -32,11 +32,13 @@ FINE = 4
 """Steps per metre of the tables of a sight model."""
 
 
-def _turn(x: Any, y: Any) -> Any:
-    """A bearing from 0 to 4 that grows with the angle, from straight back on: y / (|x| + |y|)
-    unrolled, for a tenth of what the arc tangent costs."""
+def _bins(x: Any, y: Any) -> NDArray[np.int32]:
+    """The bin of each bearing, counted from straight back, counter-clockwise: by y / (|x| + |y|),
+    which grows with the angle as well as the arc tangent does, for a tenth of its cost."""
     part = y / np.maximum(np.abs(x) + np.abs(y), np.float32(1e-9))
-    return np.where(x >= 0, part, np.where(y >= 0, 2 - part, -2 - part)) + 2
+    turn = np.where(x >= 0, part, np.where(y >= 0, 2 - part, -2 - part)) + 2
+    # Straight back is 0 and 4 at once.
+    return np.minimum((turn * (BINS / 4)).astype(np.int32), BINS - 1)
 
 
 def _bin_rays() -> tuple[Array, Array]:
@@ -68,7 +70,7 @@ def depths(boxes: Sequence[Array], reach: float) -> Single:
     half = np.where(far > radius, np.arcsin(np.minimum(radius / np.maximum(far, 1e-9), 1.0)), np.pi)
     bearing = np.arctan2(y, x)
     first, last = (
-        np.floor(_turn(np.cos(a), np.sin(a)) * BINS / 4).astype(np.int64)[near]
+        _bins(np.cos(a), np.sin(a)).astype(np.int64)[near]
         for a in (bearing - half, bearing + half)
     )
     count = np.where(half[near] >= np.pi / 2, BINS, (last - first) % BINS + 1)
@@ -125,7 +127,7 @@ class Outlook:
         x, y = c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]
         x0, y0, x1, y1 = self.range_m
         inside = (x >= x0 + margin) & (x <= x1 - margin) & (y >= y0 + margin) & (y <= y1 - margin)
-        clear = np.hypot(x, y) < self.depth[frame, (_turn(x, y) * (BINS / 4)).astype(np.int64)]
+        clear = np.hypot(x, y) < self.depth[frame, _bins(x, y)]
         return np.asarray((cell >= 0) & inside & clear, np.bool_)
 
     def counted(self, margin: float, sight: SightModel | None = None) -> Array:
@@ -190,7 +192,7 @@ def outlook(
         i, j = np.nonzero(border >= 0)
         x, y = x[i, j], y[i, j]
         distance = np.sqrt(x * x + y * y)
-        clear = distance < depth[i + k, (_turn(x, y) * (BINS / 4)).astype(np.int32)]
+        clear = distance < depth[i + k, _bins(x, y)]
         i, j = i[clear], j[clear]
         parts.append((i + k, first[i + k] + offset[j], distance[clear], border[i, j]))
     frame, cell, distance, border = (
