@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.rings import align, open_rings, overlap, polygon
+from rtmap_cli.geometry.rings import align, open_rings, overlap, polygons
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.refit import SHARPNESS
 from rtmap_cli.maps.visibility import Views, views
@@ -143,11 +143,14 @@ def _overlapping(rings: Rings, rows: Int, gate: Array, places: Array) -> Int:
     out = np.full(len(rows), -1)
     centres, radius = places.mean(axis=1), np.ptp(places, axis=1).max(axis=1)
     reach = np.hypot(*np.moveaxis(rings.feature[rows, None, :2] - centres, -1, 0))
-    k, j = np.nonzero(reach < radius)
+    near = (reach < radius) & _boxes_meet(_boxes(rings.points[rows]), _boxes(places))
+    k, j = np.nonzero(near)
     if not len(k):
         return out
-    mine = np.array([polygon(p) for p in rings.points[rows]], object)[k]
-    theirs = np.array([polygon(p) for p in places], object)[j]
+    some, one = np.unique(k, return_inverse=True)
+    them, other = np.unique(j, return_inverse=True)
+    mine = polygons(rings.points[rows[some]])[one]
+    theirs = polygons(places[them])[other]
     common, own, other = shapely.area(np.stack([shapely.intersection(mine, theirs), mine, theirs]))
     share = common / np.maximum(own + other - common, 1e-12)
     within = common / np.maximum(own, 1e-12)
@@ -159,20 +162,45 @@ def _overlapping(rings: Rings, rows: Int, gate: Array, places: Array) -> Int:
     return out
 
 
+def _boxes(rings: Array) -> Array:
+    """(n, 4) low and high corners of rings (n, k, 2)."""
+    return np.concatenate([rings.min(axis=1), rings.max(axis=1)], axis=-1)
+
+
+def _boxes_meet(boxes: Array, others: Array) -> NDArray[np.bool_]:
+    """(n, m) whether boxes (n, 4) have anything in common with others (m, 4)."""
+    low = np.maximum(boxes[:, None, :2], others[:, :2])
+    high = np.minimum(boxes[:, None, 2:], others[:, 2:])
+    return np.asarray((low <= high).all(axis=-1))
+
+
+def _hold(windows: Array, boxes: Array) -> NDArray[np.bool_]:
+    """(n,) whether each counter-clockwise rectangle (n, 4, 2) holds all of its box (n, 4)."""
+    side = np.roll(windows, -1, axis=1) - windows
+    corners = boxes[:, [[0, 1], [2, 1], [2, 3], [0, 3]]]
+    d = corners[:, :, None] - windows[:, None]
+    left = side[:, None, :, 0] * d[..., 1] - side[:, None, :, 1] * d[..., 0]
+    return np.asarray((left >= 0).all(axis=(1, 2)))
+
+
 def _cut_places(rings: Rings, rows: Int, gate: Array, places: Array) -> Int:
     """(k,) which place each of the detections ``rows`` is what the range leaves of, or -1: the
     place whose part in the range has its middle nearest to the detection's, within ``gate``."""
     out = np.full(len(rows), -1)
     if rings.window is None:
         return out
-    centres, radius = places.mean(axis=1), np.ptp(places, axis=1).max(axis=1)
-    middle = rings.feature[rows, :2]
-    reach = np.hypot(*np.moveaxis(middle[:, None] - centres, -1, 0))
-    k, j = np.nonzero(reach < radius + gate[:, None])
+    middle, box = rings.feature[rows, :2], _boxes(places)
+    # The middle of a part of a place lies in the place's box.
+    away = np.maximum(box[:, :2] - middle[:, None], middle[:, None] - box[:, 2:]).max(axis=-1)
+    k, j = np.nonzero(away < gate[:, None])
+    cut = ~_hold(rings.window[rows[k]], box[j])
+    k, j = k[cut], j[cut]
     if not len(k):
         return out
     window = shapely.polygons(rings.window[rows])
-    whole = np.array([polygon(p) for p in places], object)
+    them = np.unique(j)
+    whole = np.zeros(len(places), object)
+    whole[them] = polygons(places[them])
     part = shapely.intersection(whole[j], window[k])
     area = shapely.area(part)
     # A place that lies wholly in the range would have been seen whole.
@@ -269,11 +297,12 @@ def _mean(rings: Array, weight: Array) -> Array:
 def _apart(means: Array) -> Array:
     """Means without those that overlap an earlier (better supported) one by a third, or lie within
     ``NEAR`` of it: one crossing that a drive saw a little off must not compete with itself."""
-    shapes, places = [polygon(m) for m in means], features(means)
+    shapes, places, boxes = polygons(means), features(means), _boxes(means)
     keep: list[int] = []
     for k, shape in enumerate(shapes):
-        far = all(np.hypot.reduce(places[k] - places[j]) > NEAR for j in keep)
-        if far and all(overlap(shape, shapes[j]) < 0.3 for j in keep):
+        far = (np.hypot.reduce(places[k] - places[keep], axis=1) > NEAR).all() if keep else True
+        near = np.array(keep, np.int64)[_boxes_meet(boxes[k : k + 1], boxes[keep])[0]]
+        if far and all(overlap(shape, shapes[j]) < 0.3 for j in near):
             keep.append(k)
     return means[keep]
 
