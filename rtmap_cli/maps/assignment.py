@@ -31,8 +31,11 @@ FLOOR = 0.12
 
 def across_sigma(samples: Samples) -> Array:
     """(n,) standard deviation of each sample across its own detection, metres."""
-    normal = np.stack([-samples.tangent[:, 1], samples.tangent[:, 0]], axis=-1)
-    return np.sqrt(np.einsum("ni,nij,nj->n", normal, samples.covariance, normal))
+    tx, ty = samples.tangent.T
+    cov = samples.covariance
+    return np.sqrt(
+        ty * ty * cov[:, 0, 0] - 2 * tx * ty * cov[:, 0, 1] + tx * tx * cov[:, 1, 1]
+    )
 
 
 def sigma_scale(stations: Stations, samples: Samples) -> float:

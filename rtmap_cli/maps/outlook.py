@@ -153,11 +153,12 @@ class Outlook:
 
     def frames(self, cell: Int, margin: float) -> Int:
         """The frames that could see places in the cells, once for each place."""
-        some, number = np.unique(cell[cell >= 0], return_counts=True)
-        rows = self._by_cell[some]
-        number = np.repeat(number, np.diff(rows.indptr))
-        inside = rows.data >= margin
-        return np.repeat(rows.indices[inside], number[inside]).astype(np.int64)
+        table, rows = self._by_cell, cell[cell >= 0]
+        first = table.indptr[rows].astype(np.int64)
+        count = table.indptr[rows + 1] - first
+        at = np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
+        out: Int = table.indices[at[table.data[at] >= margin]].astype(np.int64)
+        return out
 
 
 def outlook(

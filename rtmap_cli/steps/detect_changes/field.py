@@ -106,14 +106,16 @@ def blocks(
     marks = _per_view(drives, traversals, looked)
     if not len(marks.score):
         return
-    used = np.unique(np.floor(marks.xy / side).astype(np.int64) @ np.array([1 << 32, 1]))
+    px, py = np.ascontiguousarray(marks.xy.T)
+    used = np.unique((np.floor(px / side).astype(np.int64) << 32) + np.floor(py / side).astype(int))
     for packed in used.tolist():
         # The low half of the key is signed.
         x = (packed + (1 << 31)) >> 32
         block = np.array([x, packed - (x << 32)])
         low = block * side - room
         high = low + side + 2 * room
-        near = marks.select(((marks.xy >= low) & (marks.xy < high)).all(axis=1))
+        inside = (px >= low[0]) & (px < high[0]) & (py >= low[1]) & (py < high[1])
+        near = marks.select(np.flatnonzero(inside))
         # Only the part of the block that holds anything, with room for the kernels.
         first = np.maximum(near.xy.min(axis=0) - room, low)
         last = np.minimum(near.xy.max(axis=0) + room, high)

@@ -270,19 +270,19 @@ class Ballot:
         """What one drive says about the places ``index``; a frame speaks for them when it found
         or could see half of what any frame of the drive did."""
         drive, time = self.drives[k], self.times[k]
+        if not drive.views[index].any():
+            return None
         mine = np.zeros(self.votes.shape[-1], bool)
         mine[index] = True
-        looked, found = drive.looks.frames(index), mine[drive.hit_place]
-        if not len(looked):
-            return None
-        view_frames = _mostly(looked)
-        hit_frames = np.intersect1d(_mostly(drive.hit_frame[found]), view_frames)
+        found = mine[drive.hit_place]
+        view_frames = _mostly(drive.looks.frames(index), len(time))
+        hit_frames = np.flatnonzero(_mostly(drive.hit_frame[found], len(time)) & view_frames)
         score = drive.hit_score[found]
         odds = log_odds_of(self.votes[k][:, index], self.model)
         return DriveEvidence(
             self.runs[k],
             int(time[0]),
-            len(view_frames),
+            int(view_frames.sum()),
             len(hit_frames),
             tuple(int(t) for t in time[hit_frames]),
             float(score.mean()) if len(score) else None,
@@ -292,10 +292,10 @@ class Ballot:
         )
 
 
-def _mostly(frames: Int) -> Int:
-    """The frames that occur at least half as often as the commonest one."""
-    values, number = np.unique(frames, return_counts=True)
-    return values[2 * number >= number.max()] if len(values) else values
+def _mostly(frames: Int, count: int) -> Mask:
+    """(count,) the frames that occur at least half as often as the commonest one."""
+    number = np.bincount(frames, minlength=count)
+    return (number > 0) & (2 * number >= number.max())
 
 
 @dataclass(frozen=True)
