@@ -7,7 +7,7 @@ the network's error, so that n frames are not n votes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from rtmap_cli.geometry.poses import wrap_angle, xyyaw_of
 from rtmap_cli.logs.motion import Motion, MotionModel, motion_of
 from rtmap_cli.logs.run import OUTDATED, Run
 from rtmap_cli.maps.outlook import Outlook, outlook
+from rtmap_cli.maps.stations import Samples, samples_of
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -62,6 +63,7 @@ class Traversal:
     model_sha256: str | None = None
     classes: tuple[str, ...] = ()
     motion: Motion | None = None
+    sampled: dict[str, Samples] = field(default_factory=dict, repr=False, compare=False, init=False)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -76,24 +78,34 @@ class Traversal:
         """What its frames could see."""
         return outlook(self.pose, self.range_m, self.occluders)
 
+    def samples(self, class_name: str) -> Samples:
+        """Points along its detections of a class, in the map frame."""
+        if class_name not in self.sampled:
+            k = np.flatnonzero(self.class_name == class_name)
+            self.sampled[class_name] = samples_of(
+                self.points[k], self.covariance[k], self.score[k], self.frame[k]
+            )
+        return self.sampled[class_name]
+
     def moved(self, pose: Array, pose_covariance: Array) -> Traversal:
         """The drive at other poses (m, 3) with other covariances (m, 3, 3), and what it saw."""
         turn = wrap_angle(pose[:, 2] - self.pose[:, 2])
         c, s = np.cos(turn), np.sin(turn)
-        rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=-2)
-
-        def put(points: Array, frame: Int) -> Array:
-            local = points - self.pose[frame, None, :2]
-            out: Array = np.einsum("nij,nvj->nvi", rotation[frame], local)
-            return out + pose[frame, None, :2]
-
-        r = rotation[self.frame]
+        f = self.frame
+        local = self.points - self.pose[f, None, :2]
+        xx, xy, yy = (self.covariance[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        c, s = c[f, None], s[f, None]
+        covariance = _turned_variance(np.stack([xx, yy], axis=-1), c, s)
+        covariance[..., 0, 0] -= 2 * c * s * xy
+        covariance[..., 1, 1] += 2 * c * s * xy
+        covariance[..., 0, 1] += (c * c - s * s) * xy
+        covariance[..., 1, 0] = covariance[..., 0, 1]
         return replace(
             self,
             pose=pose,
             pose_covariance=pose_covariance,
-            points=put(self.points, self.frame),
-            covariance=np.einsum("nij,nvjk,nlk->nvil", r, self.covariance, r),
+            points=_turned(local, c, s) + pose[f, None, :2],
+            covariance=covariance,
         )
 
 

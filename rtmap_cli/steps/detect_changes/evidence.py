@@ -34,7 +34,6 @@ from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, rin
 from rtmap_cli.steps.detect_changes.doubles import split_doubles
 from rtmap_cli.steps.detect_changes.lines import (
     all_line_counts,
-    class_samples,
     fused_offsets,
     joined_lines,
     new_lines,
@@ -94,7 +93,7 @@ def _lines(
     settings: Settings,
 ) -> list[Evidence]:
     policy, now_ns = settings.policy, newest_ns(traversals)
-    samples = [class_samples(t, name) for t in traversals]
+    samples = [t.samples(name) for t in traversals]
     old = [e.xy for e in prior]
     known = stations_of(old)
     sigma = [offset_sigma(known, s) for s in samples]

@@ -22,7 +22,6 @@ from rtmap_cli.maps.stations import (
     Stations,
     assign,
     loose_stretches,
-    samples_of,
     smoother,
     stations_of,
 )
@@ -51,17 +50,6 @@ USUAL_GAP, JOIN_ANGLE = 7.0, float(np.radians(25))
 """Ends of new lines that look at each other are joined over such a gap (m): boundaries go on."""
 CORNER = {"boundary": 5.0}
 """Longest extension (m) of two ends to a common corner."""
-
-
-def class_samples(traversal: Traversal, class_name: str) -> Samples:
-    """Samples of a drive's detections of one class in the map frame."""
-    index = np.flatnonzero(traversal.class_name == class_name)
-    return samples_of(
-        traversal.points[index],
-        traversal.covariance[index],
-        traversal.score[index],
-        traversal.frame[index],
-    )
 
 
 def new_lines(
