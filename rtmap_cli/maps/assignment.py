@@ -33,9 +33,7 @@ def across_sigma(samples: Samples) -> Array:
     """(n,) standard deviation of each sample across its own detection, metres."""
     tx, ty = samples.tangent.T
     cov = samples.covariance
-    return np.sqrt(
-        ty * ty * cov[:, 0, 0] - 2 * tx * ty * cov[:, 0, 1] + tx * tx * cov[:, 1, 1]
-    )
+    return np.sqrt(ty * ty * cov[:, 0, 0] - 2 * tx * ty * cov[:, 0, 1] + tx * tx * cov[:, 1, 1])
 
 
 def sigma_scale(stations: Stations, samples: Samples) -> float:

@@ -70,8 +70,7 @@ def depths(boxes: Sequence[Array], reach: float) -> Single:
     half = np.where(far > radius, np.arcsin(np.minimum(radius / np.maximum(far, 1e-9), 1.0)), np.pi)
     bearing = np.arctan2(y, x)
     first, last = (
-        _bins(np.cos(a), np.sin(a)).astype(np.int64)[near]
-        for a in (bearing - half, bearing + half)
+        _bins(np.cos(a), np.sin(a)).astype(np.int64)[near] for a in (bearing - half, bearing + half)
     )
     count = np.where(half[near] >= np.pi / 2, BINS, (last - first) % BINS + 1)
     k = np.repeat(near, count)
@@ -122,13 +121,17 @@ class Outlook:
 
     def sees(self, frame: Int, cell: Int, margin: float) -> Mask:
         """(n,) whether a frame could see a cell, ``margin`` (m) of its range left out."""
+        return (cell >= 0) & (self.clear(frame, self._middles(cell), margin) >= 0)
+
+    def clear(self, frame: Int, xy: Array, margin: float) -> Array:
+        """(n,) distance (m) of places (n, 2) from a frame, -1 where it could not see them."""
         c, s = np.cos(self.pose[:, 2])[frame], np.sin(self.pose[:, 2])[frame]
-        d = self._middles(cell) - self.pose[frame, :2]
-        x, y = c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]
+        dx, dy = (xy[:, k] - self.pose[:, k][frame] for k in (0, 1))
+        x, y = c * dx + s * dy, c * dy - s * dx
         x0, y0, x1, y1 = self.range_m
         inside = (x >= x0 + margin) & (x <= x1 - margin) & (y >= y0 + margin) & (y <= y1 - margin)
-        clear = np.hypot(x, y) < self.depth[frame, _bins(x, y)]
-        return np.asarray((cell >= 0) & inside & clear, np.bool_)
+        distance = np.sqrt(x * x + y * y)
+        return np.where(inside & (distance < self.depth[frame, _bins(x, y)]), distance, -1.0)
 
     def counted(self, margin: float, sight: SightModel | None = None) -> Array:
         """(cells + 1,) frames that could see each cell, or their summed detection probabilities by

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rtmap_cli.geometry.rings import align, open_rings, overlap, polygons
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.refit import SHARPNESS
-from rtmap_cli.maps.visibility import Views, views
+from rtmap_cli.maps.visibility import Views
 from rtmap_cli.steps.detect_changes.votes import (
     DriveCounts,
     answer_value,
@@ -309,25 +309,26 @@ def _apart(means: Array) -> Array:
 
 def _ring_views(places: Array, traversal: Traversal) -> tuple[Views, Array]:
     """Frames that could see each ring, and the weight of each view."""
-    n = len(places)
     outline = places[:, :: max(places.shape[1] // 16, 1)]
     points = np.concatenate([outline, places.mean(axis=1, keepdims=True)], axis=1)
-    per = points.shape[1]
-    seen = views(
-        points.reshape(-1, 2),
-        traversal.pose,
-        traversal.range_m,
-        traversal.occluders,
-        margin=RING_MARGIN,
-    )
-    key = seen.frame * n + seen.point // per
-    keys, inverse = np.unique(key, return_inverse=True)
-    share = np.bincount(inverse, minlength=len(keys)) / per
-    distance = np.bincount(inverse, seen.distance) / np.bincount(inverse) if len(keys) else share
+    per, pose = points.shape[1], traversal.pose
+    # Of a ring that is seen whole enough the middle is in the range, or nearly so.
+    room = np.ptp(places, axis=1).max(axis=1, initial=0.0) / 2
+    c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
+    dx, dy = (points[:, -1, k] - pose[:, k, None] for k in (0, 1))
+    x, y = c * dx + s * dy, c * dy - s * dx
+    x0, y0, x1, y1 = traversal.range_m
+    near = (x >= x0 - room) & (x <= x1 + room) & (y >= y0 - room) & (y <= y1 + room)
+    frame, ring = np.nonzero(near)
+    distance = traversal.outlook.clear(
+        np.repeat(frame, per), points[ring].reshape(-1, 2), RING_MARGIN
+    ).reshape(-1, per)
+    seen = distance >= 0
+    share = seen.mean(axis=1)
     ok = share >= VISIBLE
-    whole = Views(keys[ok] // n, keys[ok] % n, distance[ok])
-    near = 1.0 - FAR_LOSS * np.minimum(distance[ok] / 36.0, 1.0) ** 2
-    return whole, np.minimum(share[ok] + 0.2, 1.0) * near
+    share, far = share[ok], np.where(seen, distance, 0.0)[ok].sum(axis=1) / seen[ok].sum(axis=1)
+    loss = 1.0 - FAR_LOSS * np.minimum(far / 36.0, 1.0) ** 2
+    return Views(frame[ok], ring[ok], far), np.minimum(share + 0.2, 1.0) * loss
 
 
 def ring_counts(

@@ -45,10 +45,10 @@ class Marks:
         return Marks(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
-BELL = np.linspace(-2.4, 2.4, 9)
+BELL = np.linspace(-2.4, 2.4, 17)
 """Where the bell across a line is laid down, in sigmas: with steps below a sigma its sum is that
 of the bell to a millionth."""
-APART = 2
+APART = 1
 """Samples are laid down about so many cells apart along their lines."""
 WIDEST = 1.2
 """Larger sigmas (m) are taken as that: wider bells say nothing and cost most."""
