@@ -29,13 +29,6 @@ FLOOR = 0.12
 """Standard deviation (m) of the map and of the pose, beside that of a detection."""
 
 
-def across_sigma(samples: Samples) -> Array:
-    """(n,) standard deviation of each sample across its own detection, metres."""
-    tx, ty = samples.tangent.T
-    cov = samples.covariance
-    return np.sqrt(ty * ty * cov[:, 0, 0] - 2 * tx * ty * cov[:, 0, 1] + tx * tx * cov[:, 1, 1])
-
-
 def sigma_scale(stations: Stations, samples: Samples) -> float:
     """By how much the stated sigmas of a drive are too small (> 1) or too large (< 1).
 
@@ -45,14 +38,14 @@ def sigma_scale(stations: Stations, samples: Samples) -> float:
     feet, _ = assign(stations, samples)
     if len(feet) < 100:
         return 1.0
-    sigma = np.sqrt(across_sigma(samples)[feet.sample] ** 2 + FLOOR**2)
+    sigma = np.sqrt(samples.across_sigma[feet.sample] ** 2 + FLOOR**2)
     return float(np.clip(np.median(np.abs(feet.offset) / sigma) / 0.674, 0.5, 2.0))
 
 
 def offset_sigma(stations: Stations, samples: Samples) -> Array:
     """(n,) standard deviation (m) of the samples' offsets from the lines that they belong to."""
     scale = sigma_scale(stations, samples)
-    return np.sqrt((scale * across_sigma(samples)) ** 2 + FLOOR**2)
+    return np.sqrt((scale * samples.across_sigma) ** 2 + FLOOR**2)
 
 
 def assign_once(

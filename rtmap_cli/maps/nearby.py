@@ -59,7 +59,7 @@ class Nearby:
 
     def _rows(self, cell: Int) -> Int:
         if self.row is not None:
-            return self.row[cell]
+            return self.row[cell].astype(np.int64)
         at = np.minimum(np.searchsorted(self.cell, cell), len(self.cell) - 1)
         return np.where(self.cell[at] == cell, at, -1)
 

@@ -116,8 +116,7 @@ class Outlook:
 
     def _middles(self, cell: Int) -> Array:
         row, column = np.divmod(cell, self.shape[1])
-        out: Array = (np.stack([column, row], axis=-1) + self.low + 0.5) * CELL
-        return out
+        return np.asarray((np.stack([column, row], axis=-1) + self.low + 0.5) * CELL, np.float64)
 
     def sees(self, frame: Int, cell: Int, margin: float) -> Mask:
         """(n,) whether a frame could see a cell, ``margin`` (m) of its range left out."""
@@ -131,7 +130,8 @@ class Outlook:
         x0, y0, x1, y1 = self.range_m
         inside = (x >= x0 + margin) & (x <= x1 - margin) & (y >= y0 + margin) & (y <= y1 - margin)
         distance = np.sqrt(x * x + y * y)
-        return np.where(inside & (distance < self.depth[frame, _bins(x, y)]), distance, -1.0)
+        seen = inside & (distance < self.depth[frame, _bins(x, y)])
+        return np.where(seen, distance, -1.0)
 
     def counted(self, margin: float, sight: SightModel | None = None) -> Array:
         """(cells + 1,) frames that could see each cell, or their summed detection probabilities by

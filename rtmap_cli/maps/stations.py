@@ -104,6 +104,13 @@ class Samples:
     def __len__(self) -> int:
         return len(self.xy)
 
+    @cached_property
+    def across_sigma(self) -> Array:
+        """(n,) standard deviation of each sample across its own detection, metres."""
+        tx, ty = self.tangent.T
+        xx, xy, yy = (self.covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        return np.asarray(np.sqrt(ty * ty * xx - 2 * tx * ty * xy + tx * tx * yy))
+
 
 @dataclass(frozen=True)
 class Feet:

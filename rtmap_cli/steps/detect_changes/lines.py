@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.logs.traversal import Traversal, pose_variance
-from rtmap_cli.maps.assignment import across_sigma, assign_once
+from rtmap_cli.maps.assignment import assign_once
 from rtmap_cli.maps.refit import (
     FusionModel,
     combine,
@@ -63,7 +63,7 @@ def new_lines(
     for s in samples:
         _, taken = assign_once(prior, s)
         k = loose_stretches(s, taken, SHORTEST)
-        drives.append(Marks(s.xy[k], s.tangent[k], s.spacing[k], across_sigma(s)[k], s.score[k]))
+        drives.append(Marks(s.xy[k], s.tangent[k], s.spacing[k], s.across_sigma[k], s.score[k]))
     widths = np.concatenate([d.sigma for d in drives])
     if not len(widths):
         return []

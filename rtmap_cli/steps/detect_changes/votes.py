@@ -113,8 +113,8 @@ def _best_hits(key: Int, value: Array, score: Array) -> tuple[Int, Array, Array]
     order = np.argsort(key)
     key = key[order]
     first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-    best = (np.maximum.reduceat(v[order], first) for v in (value, score))
-    return key[first], *best
+    best = [np.maximum.reduceat(v[order], first) for v in (value, score)]
+    return key[first], best[0], best[1]
 
 
 def _counted(
@@ -191,10 +191,11 @@ def line_counts(
     keys.append(asked_key)
     values.append(answer_value(existence))
     scores.append(existence)
-    hits = _best_hits(*map(np.concatenate, (keys, values, scores)))
-    at, place = np.divmod(hits[0], n)
+    key, value, score = _best_hits(*map(np.concatenate, (keys, values, scores)))
+    at, place = np.divmod(key, n)
     ok = outlook.sees(at, cell[place], margin)
-    return _counted(n, CellLooks(outlook, cell, margin), views_, *(h[ok] for h in hits))
+    looked = CellLooks(outlook, cell, margin)
+    return _counted(n, looked, views_, key[ok], value[ok], score[ok])
 
 
 def _asked_stations(

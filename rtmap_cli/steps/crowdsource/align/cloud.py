@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.keys import packed
 from rtmap_cli.logs.traversal import Traversal
-from rtmap_cli.maps.assignment import across_sigma
 from rtmap_cli.maps.stations import samples_of
 
 Array = NDArray[np.float64]
@@ -65,7 +64,7 @@ def cloud_of(traversals: Sequence[Traversal], first: Int) -> Cloud:
         index = np.flatnonzero(t.score >= MIN_SCORE)
         s = samples_of(t.points[index], t.covariance[index], t.score[index], t.frame[index])
         p = t.pose[s.frame]
-        variance = np.maximum(across_sigma(s) ** 2, 0.01)
+        variance = np.maximum(s.across_sigma**2, 0.01)
         step = np.hypot(*np.diff(t.pose[:, :2], axis=0, append=t.pose[-1:, :2]).T)
         each = 2 * t.points.shape[1] - 1
         kind = np.repeat(np.searchsorted(names, t.class_name[index].astype(str)), each)
@@ -124,7 +123,7 @@ class Grid:
         plane = self.size * self.size
         flat = kind * plane + cells[:, 0] * self.size + cells[:, 1]
         out = np.empty((kinds, 3, plane))
-        for c, along in enumerate((1.0, np.cos(2 * angle), np.sin(2 * angle))):
+        for c, along in enumerate((np.ones_like(angle), np.cos(2 * angle), np.sin(2 * angle))):
             out[:, c] = np.bincount(flat, weight * along, kinds * plane).reshape(kinds, plane)
         return out.reshape(kinds, 3, self.size, self.size)
 

@@ -95,7 +95,7 @@ def _add_agreement(
     row, column = (np.clip(cell[first, k] - LAGS, 0, size - 2 * LAGS - 1) for k in (0, 1))
     which = stretch[first]
     ends = np.flatnonzero(np.append(which[1:] != which[:-1], True)) + 1
-    for c, along in enumerate((1.0, np.cos(2 * angle), np.sin(2 * angle))):
+    for c, along in enumerate((np.ones_like(angle), np.cos(2 * angle), np.sin(2 * angle))):
         mass = np.bincount(owner, weight * along, len(first))
         for a, b in pairwise([0, *ends.tolist()]):
             part = windows[kind[first[a:b]], c, row[a:b], column[a:b]].reshape(b - a, -1)
