@@ -35,7 +35,7 @@ def test_depths_hide_what_boxes_hide():
         assert wrong.mean() < 0.015
         # Bearings are half a degree apart: the answers differ along the edges of shadows only.
         for p in points[wrong]:
-            angle = np.arctan2(p[1], p[0]) + np.radians(np.linspace(-0.9, 0.9, 13))
+            angle = np.arctan2(p[1], p[0]) + np.radians(np.linspace(-0.9, 0.9, 181))
             turned = np.hypot(*p) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
             around = np.concatenate([turned, p * np.linspace(0.97, 1.03, 13)[:, None]])
             assert len(set(hidden(around, boxes).tolist())) == 2
