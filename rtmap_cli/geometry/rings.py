@@ -100,3 +100,13 @@ def polygon(ring: Array) -> object:
 
     out = shapely.polygons(ring[:, :2] if len(ring) > 3 else close(ring[:, :2]))
     return out if out.is_valid else shapely.buffer(out, 0)
+
+
+def polygons(rings: Array) -> NDArray[np.object_]:
+    """(n,) valid shapely polygons of rings (n, k, 2)."""
+    import shapely
+
+    out = np.atleast_1d(shapely.polygons(rings)) if len(rings) else np.zeros(0, object)
+    bad = ~shapely.is_valid(out)
+    out[bad] = shapely.buffer(out[bad], 0)
+    return np.asarray(out, object)

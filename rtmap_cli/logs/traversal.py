@@ -7,7 +7,8 @@ the network's error, so that n frames are not n votes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.poses import wrap_angle, xyyaw_of
 from rtmap_cli.logs.motion import Motion, MotionModel, motion_of
 from rtmap_cli.logs.run import OUTDATED, Run
+from rtmap_cli.maps.outlook import Outlook, outlook
+from rtmap_cli.maps.stations import Samples, samples_of
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -60,6 +63,7 @@ class Traversal:
     model_sha256: str | None = None
     classes: tuple[str, ...] = ()
     motion: Motion | None = None
+    sampled: dict[str, Samples] = field(default_factory=dict, repr=False, compare=False, init=False)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -69,24 +73,39 @@ class Traversal:
         """Distance driven between its frames."""
         return float(np.hypot(*np.diff(self.pose[:, :2], axis=0).T).sum()) / 1000
 
+    @cached_property
+    def outlook(self) -> Outlook:
+        """What its frames could see."""
+        return outlook(self.pose, self.range_m, self.occluders)
+
+    def samples(self, class_name: str) -> Samples:
+        """Points along its detections of a class, in the map frame."""
+        if class_name not in self.sampled:
+            k = np.flatnonzero(self.class_name == class_name)
+            self.sampled[class_name] = samples_of(
+                self.points[k], self.covariance[k], self.score[k], self.frame[k]
+            )
+        return self.sampled[class_name]
+
     def moved(self, pose: Array, pose_covariance: Array) -> Traversal:
         """The drive at other poses (m, 3) with other covariances (m, 3, 3), and what it saw."""
         turn = wrap_angle(pose[:, 2] - self.pose[:, 2])
         c, s = np.cos(turn), np.sin(turn)
-        rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=-2)
-
-        def put(points: Array, frame: Int) -> Array:
-            local = points - self.pose[frame, None, :2]
-            out: Array = np.einsum("nij,nvj->nvi", rotation[frame], local)
-            return out + pose[frame, None, :2]
-
-        r = rotation[self.frame]
+        f = self.frame
+        local = self.points - self.pose[f, None, :2]
+        xx, xy, yy = (self.covariance[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        c, s = c[f, None], s[f, None]
+        covariance = _turned_variance(np.stack([xx, yy], axis=-1), c, s)
+        covariance[..., 0, 0] -= 2 * c * s * xy
+        covariance[..., 1, 1] += 2 * c * s * xy
+        covariance[..., 0, 1] += (c * c - s * s) * xy
+        covariance[..., 1, 0] = covariance[..., 0, 1]
         return replace(
             self,
             pose=pose,
             pose_covariance=pose_covariance,
-            points=put(self.points, self.frame),
-            covariance=np.einsum("nij,nvjk,nlk->nvil", r, self.covariance, r),
+            points=_turned(local, c, s) + pose[f, None, :2],
+            covariance=covariance,
         )
 
 
@@ -141,10 +160,30 @@ def usable_poses(run: Run) -> tuple[NDArray[np.bool_], Array, Array]:
     return usable, pose, covariance
 
 
+def _turned(points: Array, c: Array, s: Array) -> Array:
+    """Points (..., 2) turned by angles of cosine ``c`` and sine ``s``."""
+    x, y = points[..., 0], points[..., 1]
+    out = np.empty(points.shape)
+    out[..., 0], out[..., 1] = c * x - s * y, s * x + c * y
+    return out
+
+
+def _turned_variance(variance: Array, c: Array, s: Array) -> Array:
+    """(..., 2, 2) = R diag(v) Rᵀ of variances (..., 2) along the axes before the turn R."""
+    x, y = variance[..., 0], variance[..., 1]
+    out = np.empty((*variance.shape, 2))
+    out[..., 0, 0] = c * c * x + s * s * y
+    out[..., 1, 1] = s * s * x + c * c * y
+    out[..., 0, 1] = out[..., 1, 0] = c * s * (x - y)
+    return out
+
+
 def _cut(points: Array, box: tuple[float, float, float, float], margin: float) -> Any:
     """(n,) True where an element reaches the border of the range: it may go on beyond."""
-    low, high = np.array(box[:2]) + margin, np.array(box[2:]) - margin
-    return ((points < low) | (points > high)).any(axis=(1, 2))
+    x, y = points[..., 0], points[..., 1]
+    beyond = (x < box[0] + margin) | (x > box[2] - margin)
+    beyond |= (y < box[1] + margin) | (y > box[3] - margin)
+    return beyond.any(axis=1)
 
 
 def range_box(run: Run) -> tuple[float, float, float, float]:
@@ -179,11 +218,11 @@ def traversal_of(run: Run, min_score: float = FOUND_SCORE) -> Traversal:
     asked = (frame >= 0) & np.isfinite(o.existence) & np.isfinite(o.prior_points).all((1, 2))
     f = frame[detected]
     c, s = np.cos(pose[f, 2]), np.sin(pose[f, 2])
-    rotation = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=-2)
     local = o.points[detected].astype(np.float64)
     variance = o.sigma[detected].astype(np.float64) ** 2
-    points = np.einsum("nij,nvj->nvi", rotation, local) + pose[f, None, :2]
-    covariance = np.einsum("nij,nvj,nkj->nvik", rotation, variance, rotation)
+    points = _turned(local, c[:, None], s[:, None])
+    points += pose[f, None, :2]
+    covariance = _turned_variance(variance, c[:, None], s[:, None])
     rows = {int(k): int(v) for k, v in enumerate(row) if v >= 0}
     return Traversal(
         run_id=run.log_id,
@@ -222,10 +261,15 @@ def pose_variance(traversal: Traversal, frame: Int, xy: Array, normal: Array) ->
 
     First-order: δp = δt + δyaw · J (p − t) with J the quarter turn.
     """
-    lever = xy - traversal.pose[frame, :2]
-    across = normal[:, 0] * -lever[:, 1] + normal[:, 1] * lever[:, 0]
-    jacobian = np.column_stack([normal, across])
-    return np.einsum("ni,nij,nj->n", jacobian, traversal.pose_covariance[frame], jacobian)
+    dx, dy = (xy[:, k] - traversal.pose[:, k][frame] for k in (0, 1))
+    nx, ny = normal.T
+    jacobian = nx, ny, ny * dx - nx * dy
+    out = np.zeros(len(frame))
+    for i in range(3):
+        for j in range(i, 3):
+            share = traversal.pose_covariance[:, i, j][frame] * jacobian[i] * jacobian[j]
+            out += share if i == j else 2 * share
+    return out
 
 
 def find_runs(folder: str | Path) -> list[Path]:

@@ -31,12 +31,6 @@ FLOOR = 0.12
 """Standard deviation (m) of the map and of the pose, beside that of a detection."""
 
 
-def across_sigma(samples: Samples) -> Array:
-    """(n,) standard deviation of each sample across its own detection, metres."""
-    normal = np.stack([-samples.tangent[:, 1], samples.tangent[:, 0]], axis=-1)
-    return np.sqrt(np.einsum("ni,nij,nj->n", normal, samples.covariance, normal))
-
-
 def sigma_scale(stations: Stations, samples: Samples) -> float:
     """By how much the stated sigmas of a drive are too small (> 1) or too large (< 1).
 
@@ -46,14 +40,14 @@ def sigma_scale(stations: Stations, samples: Samples) -> float:
     feet, _ = assign(stations, samples)
     if len(feet) < 100:
         return 1.0
-    sigma = np.sqrt(across_sigma(samples)[feet.sample] ** 2 + FLOOR**2)
+    sigma = np.sqrt(samples.across_sigma[feet.sample] ** 2 + FLOOR**2)
     return float(np.clip(np.median(np.abs(feet.offset) / sigma) / 0.674, 0.5, 2.0))
 
 
 def offset_sigma(stations: Stations, samples: Samples) -> Array:
     """(n,) standard deviation (m) of the samples' offsets from the lines that they belong to."""
     scale = sigma_scale(stations, samples)
-    return np.sqrt((scale * across_sigma(samples)) ** 2 + FLOOR**2)
+    return np.sqrt((scale * samples.across_sigma) ** 2 + FLOOR**2)
 
 
 def assign_once(
@@ -76,7 +70,7 @@ def assign_once(
     if len(stations) and len(samples):
         gate = GATE
         if wide:
-            gate = float(np.clip(WIDE * np.median(across_sigma(samples)), GATE, 2 * GATE))
+            gate = float(np.clip(WIDE * np.median(samples.across_sigma), GATE, 2 * GATE))
         feet = _Feet(stations, samples, gate)
         stages = [None] if first is None else [first, ~first]
         for stage in stages:

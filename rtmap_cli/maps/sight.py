@@ -50,9 +50,13 @@ class SightModel:
     def weight(self, look: Look) -> Array:
         """(n,) detection probability of each look, relative to the best one."""
         out = np.ones(len(look.distance))
-        for name, knots in KNOTS.items():
-            out *= np.interp(getattr(look, name), knots, getattr(self, name))
+        for name in KNOTS:
+            out *= self.curve(name, getattr(look, name))
         return out
+
+    def curve(self, name: str, value: Array) -> Array:
+        """(n,) relative probability by one of the ``KNOTS``, at values in metres."""
+        return np.interp(value, KNOTS[name], getattr(self, name))
 
 
 def measured_sight(look: Look, found: NDArray[np.bool_]) -> SightModel:

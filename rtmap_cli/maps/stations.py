@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import arc_length, is_ring
+from rtmap_cli.maps.nearby import Nearby, nearby
 from rtmap_cli.maps.strands import strands_of
 
 Array = NDArray[np.float64]
@@ -50,6 +51,7 @@ class Stations:
     spacing: Array
     to_end: Array
     lines: list[Array] = field(repr=False)
+    grids: dict[float, Nearby] = field(default_factory=dict, repr=False, compare=False)
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -70,6 +72,13 @@ class Stations:
     def strand(self) -> Int:
         """(n,) like ``chain``, but cut where a chain folds back to itself."""
         return strands_of(self.xy, self.tangent, self.s, self.line, self.chain)
+
+    def near(self, gate: float) -> Nearby:
+        """The stations near points; points within ``gate`` (m) of a line find it."""
+        if gate not in self.grids:
+            reach = float(np.hypot(gate, STEP))
+            self.grids[gate] = nearby(self.xy, self.tangent, self.s, self.line, reach)
+        return self.grids[gate]
 
     def of_line(self, k: int) -> Int:
         """Indices of the stations of line ``k`` in order (they lie together)."""
@@ -96,11 +105,11 @@ class Samples:
         return len(self.xy)
 
     @cached_property
-    def tree(self) -> Any:
-        """KD-tree of the samples: they meet many generations of lines."""
-        from scipy.spatial import cKDTree
-
-        return cKDTree(self.xy)
+    def across_sigma(self) -> Array:
+        """(n,) standard deviation of each sample across its own detection, metres."""
+        tx, ty = self.tangent.T
+        xx, xy, yy = (self.covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        return np.asarray(np.sqrt(ty * ty * xx - 2 * tx * ty * xy + tx * tx * yy))
 
 
 @dataclass(frozen=True)
@@ -260,31 +269,26 @@ def candidate_feet(
     """Best foot of each sample on each chain, or ``unit`` (n,) of stations, in reach: sample,
     station, offset, along."""
     unit = stations.chain if unit is None else unit
-    reach = float(np.hypot(gate, STEP))
-    near = samples.tree.sparse_distance_matrix(stations.tree, reach, output_type="ndarray")
-    i, j = near["i"].astype(np.int64), near["j"].astype(np.int64)
+    i, j = stations.near(gate).candidates(samples.xy)
     tx, ty = stations.tangent[:, 0][j], stations.tangent[:, 1][j]
     dx = samples.xy[:, 0][i] - stations.xy[:, 0][j]
     dy = samples.xy[:, 1][i] - stations.xy[:, 1][j]
     along, offset = dx * tx + dy * ty, tx * dy - ty * dx
     aligned = np.abs(samples.tangent[:, 0][i] * tx + samples.tangent[:, 1][i] * ty) >= MIN_COS
     ok = np.flatnonzero(aligned & (np.abs(offset) <= gate) & (np.abs(along) <= STEP))
-    if not len(ok):
-        none = np.zeros(0, np.int64)
-        return none, none, np.zeros(0), np.zeros(0)
     i, j, along, offset = i[ok], j[ok], along[ok], offset[ok]
-    key = i * (int(unit.max()) + 1) + unit[j]
-    order = np.argsort(key)
-    key = key[order]
-    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-    size = np.diff(np.append(first, len(key)))
-    far = (along**2 + offset**2)[order]
-    nearest = far == np.repeat(np.minimum.reduceat(far, first), size)
-    # Of two that are as near the first station counts, whatever the order of the pairs.
-    station = np.where(nearest, j[order], len(stations))
-    best = station == np.repeat(np.minimum.reduceat(station, first), size)
-    k = order[best]
-    return i[k], j[k], offset[k], along[k]
+    same = i[1:] == i[:-1]
+    twice = np.flatnonzero(np.append(same, False) | np.insert(same, 0, False))
+    if len(twice):
+        # Of two feet on one chain the nearest one counts, or else the first station.
+        i2, j2, far = i[twice], j[twice], (along**2 + offset**2)[twice]
+        order = np.lexsort((j2, far, unit[j2], i2))
+        key = np.stack([i2, unit[j2]])[:, order]
+        again = (key[:, 1:] == key[:, :-1]).all(axis=0)
+        keep = np.ones(len(i), bool)
+        keep[twice[order[1:][again]]] = False
+        i, j, along, offset = i[keep], j[keep], along[keep], offset[keep]
+    return i, j, offset, along
 
 
 def assign(

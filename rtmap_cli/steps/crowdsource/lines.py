@@ -18,7 +18,7 @@ from rtmap_cli.maps.refit import (
     solve_vertices,
 )
 from rtmap_cli.maps.registration import registered
-from rtmap_cli.maps.stations import Stations, assign, samples_of, smoother, stations_of
+from rtmap_cli.maps.stations import Stations, assign, smoother, stations_of
 
 Array = NDArray[np.float64]
 
@@ -160,10 +160,7 @@ def _offsets(
     smooth = smoother(stations, model.width)
     drives = []
     for traversal in traversals:
-        k = np.flatnonzero(traversal.class_name == class_name)
-        samples = samples_of(
-            traversal.points[k], traversal.covariance[k], traversal.score[k], traversal.frame[k]
-        )
+        samples = traversal.samples(class_name)
         if known is not None:
             samples = registered(samples, known)
         feet, _ = assign(stations, samples)

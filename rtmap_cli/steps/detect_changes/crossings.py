@@ -9,10 +9,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.rings import align, open_rings, overlap, polygon
+from rtmap_cli.geometry.rings import align, open_rings, overlap, polygons
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.refit import SHARPNESS
-from rtmap_cli.maps.visibility import Views, views
+from rtmap_cli.maps.visibility import Views
 from rtmap_cli.steps.detect_changes.votes import (
     DriveCounts,
     answer_value,
@@ -143,11 +143,14 @@ def _overlapping(rings: Rings, rows: Int, gate: Array, places: Array) -> Int:
     out = np.full(len(rows), -1)
     centres, radius = places.mean(axis=1), np.ptp(places, axis=1).max(axis=1)
     reach = np.hypot(*np.moveaxis(rings.feature[rows, None, :2] - centres, -1, 0))
-    k, j = np.nonzero(reach < radius)
+    near = (reach < radius) & _boxes_meet(_boxes(rings.points[rows]), _boxes(places))
+    k, j = np.nonzero(near)
     if not len(k):
         return out
-    mine = np.array([polygon(p) for p in rings.points[rows]], object)[k]
-    theirs = np.array([polygon(p) for p in places], object)[j]
+    some, one = np.unique(k, return_inverse=True)
+    them, other = np.unique(j, return_inverse=True)
+    mine = polygons(rings.points[rows[some]])[one]
+    theirs = polygons(places[them])[other]
     common, own, other = shapely.area(np.stack([shapely.intersection(mine, theirs), mine, theirs]))
     share = common / np.maximum(own + other - common, 1e-12)
     within = common / np.maximum(own, 1e-12)
@@ -159,20 +162,45 @@ def _overlapping(rings: Rings, rows: Int, gate: Array, places: Array) -> Int:
     return out
 
 
+def _boxes(rings: Array) -> Array:
+    """(n, 4) low and high corners of rings (n, k, 2)."""
+    return np.concatenate([rings.min(axis=1), rings.max(axis=1)], axis=-1)
+
+
+def _boxes_meet(boxes: Array, others: Array) -> NDArray[np.bool_]:
+    """(n, m) whether boxes (n, 4) have anything in common with others (m, 4)."""
+    low = np.maximum(boxes[:, None, :2], others[:, :2])
+    high = np.minimum(boxes[:, None, 2:], others[:, 2:])
+    return np.asarray((low <= high).all(axis=-1))
+
+
+def _hold(windows: Array, boxes: Array) -> NDArray[np.bool_]:
+    """(n,) whether each counter-clockwise rectangle (n, 4, 2) holds all of its box (n, 4)."""
+    side = np.roll(windows, -1, axis=1) - windows
+    corners = boxes[:, [[0, 1], [2, 1], [2, 3], [0, 3]]]
+    d = corners[:, :, None] - windows[:, None]
+    left = side[:, None, :, 0] * d[..., 1] - side[:, None, :, 1] * d[..., 0]
+    return np.asarray((left >= 0).all(axis=(1, 2)))
+
+
 def _cut_places(rings: Rings, rows: Int, gate: Array, places: Array) -> Int:
     """(k,) which place each of the detections ``rows`` is what the range leaves of, or -1: the
     place whose part in the range has its middle nearest to the detection's, within ``gate``."""
     out = np.full(len(rows), -1)
     if rings.window is None:
         return out
-    centres, radius = places.mean(axis=1), np.ptp(places, axis=1).max(axis=1)
-    middle = rings.feature[rows, :2]
-    reach = np.hypot(*np.moveaxis(middle[:, None] - centres, -1, 0))
-    k, j = np.nonzero(reach < radius + gate[:, None])
+    middle, box = rings.feature[rows, :2], _boxes(places)
+    # The middle of a part of a place lies in the place's box.
+    away = np.maximum(box[:, :2] - middle[:, None], middle[:, None] - box[:, 2:]).max(axis=-1)
+    k, j = np.nonzero(away < gate[:, None])
+    cut = ~_hold(rings.window[rows[k]], box[j])
+    k, j = k[cut], j[cut]
     if not len(k):
         return out
     window = shapely.polygons(rings.window[rows])
-    whole = np.array([polygon(p) for p in places], object)
+    them = np.unique(j)
+    whole = np.zeros(len(places), object)
+    whole[them] = polygons(places[them])
     part = shapely.intersection(whole[j], window[k])
     area = shapely.area(part)
     # A place that lies wholly in the range would have been seen whole.
@@ -269,36 +297,38 @@ def _mean(rings: Array, weight: Array) -> Array:
 def _apart(means: Array) -> Array:
     """Means without those that overlap an earlier (better supported) one by a third, or lie within
     ``NEAR`` of it: one crossing that a drive saw a little off must not compete with itself."""
-    shapes, places = [polygon(m) for m in means], features(means)
+    shapes, places, boxes = polygons(means), features(means), _boxes(means)
     keep: list[int] = []
     for k, shape in enumerate(shapes):
-        far = all(np.hypot.reduce(places[k] - places[j]) > NEAR for j in keep)
-        if far and all(overlap(shape, shapes[j]) < 0.3 for j in keep):
+        far = (np.hypot.reduce(places[k] - places[keep], axis=1) > NEAR).all() if keep else True
+        near = np.array(keep, np.int64)[_boxes_meet(boxes[k : k + 1], boxes[keep])[0]]
+        if far and all(overlap(shape, shapes[j]) < 0.3 for j in near):
             keep.append(k)
     return means[keep]
 
 
 def _ring_views(places: Array, traversal: Traversal) -> tuple[Views, Array]:
     """Frames that could see each ring, and the weight of each view."""
-    n = len(places)
     outline = places[:, :: max(places.shape[1] // 16, 1)]
     points = np.concatenate([outline, places.mean(axis=1, keepdims=True)], axis=1)
-    per = points.shape[1]
-    seen = views(
-        points.reshape(-1, 2),
-        traversal.pose,
-        traversal.range_m,
-        traversal.occluders,
-        margin=RING_MARGIN,
-    )
-    key = seen.frame * n + seen.point // per
-    keys, inverse = np.unique(key, return_inverse=True)
-    share = np.bincount(inverse, minlength=len(keys)) / per
-    distance = np.bincount(inverse, seen.distance) / np.bincount(inverse) if len(keys) else share
+    per, pose = points.shape[1], traversal.pose
+    # Of a ring that is seen whole enough the middle is in the range, or nearly so.
+    room = np.ptp(places, axis=1).max(axis=1, initial=0.0) / 2
+    c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
+    dx, dy = (points[:, -1, k] - pose[:, k, None] for k in (0, 1))
+    x, y = c * dx + s * dy, c * dy - s * dx
+    x0, y0, x1, y1 = traversal.range_m
+    near = (x >= x0 - room) & (x <= x1 + room) & (y >= y0 - room) & (y <= y1 + room)
+    frame, ring = np.nonzero(near)
+    distance = traversal.outlook.clear(
+        np.repeat(frame, per), points[ring].reshape(-1, 2), RING_MARGIN
+    ).reshape(-1, per)
+    seen = distance >= 0
+    share = seen.mean(axis=1)
     ok = share >= VISIBLE
-    whole = Views(keys[ok] // n, keys[ok] % n, distance[ok])
-    near = 1.0 - FAR_LOSS * np.minimum(distance[ok] / 36.0, 1.0) ** 2
-    return whole, np.minimum(share[ok] + 0.2, 1.0) * near
+    share, far = share[ok], np.where(seen, distance, 0.0)[ok].sum(axis=1) / seen[ok].sum(axis=1)
+    loss = 1.0 - FAR_LOSS * np.minimum(far / 36.0, 1.0) ** 2
+    return Views(frame[ok], ring[ok], far), np.minimum(share + 0.2, 1.0) * loss
 
 
 def ring_counts(

@@ -35,7 +35,6 @@ from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, rin
 from rtmap_cli.steps.detect_changes.doubles import split_doubles
 from rtmap_cli.steps.detect_changes.lines import (
     all_line_counts,
-    class_samples,
     fused_offsets,
     joined_lines,
     new_lines,
@@ -97,7 +96,7 @@ def _lines(
     policy, now_ns = settings.policy, newest_ns(traversals)
     old = [e.xy for e in prior]
     known = stations_of(old)
-    seen = [class_samples(t, name) for t in traversals]
+    seen = [t.samples(name) for t in traversals]
     samples = [registered(s, known) for s in seen]
     sigma = [offset_sigma(known, s) for s in samples]
     feet = [assign_once(known, s)[0] for s in samples]
@@ -155,7 +154,8 @@ def _line_votes(
     doubtful = questioned(votes, pairs, before)
     some = np.flatnonzero(fresh)
     for asked, rows in ((picked, np.arange(len(fresh))), (doubtful, some)):
-        if asked.any() and len(rows):
+        # When all choose last they choose as they did.
+        if asked.any() and len(rows) and not (asked | picked).all():
             without = all_line_counts(*drives, first=~(asked | picked))
             votes = weighed(
                 votes,

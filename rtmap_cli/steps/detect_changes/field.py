@@ -7,14 +7,14 @@ frames that could see the cell; then the mean over the drives that looked: one v
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.logs.traversal import Traversal
-from rtmap_cli.maps.visibility import views
+from rtmap_cli.maps.outlook import CELL as VIEW_CELL
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -25,8 +25,8 @@ BLOCK = 640
 """Cells of a block's side: memory is bounded by a block, not by the map."""
 MARGIN = 24
 """Cells around a block that are computed but not used, wider than any kernel."""
-COARSE = 10
-"""Cells per side of a square whose views are counted once."""
+VIEW_MARGIN = 1.0
+"""Border (m) of the range that does not count as looked at."""
 
 
 @dataclass(frozen=True)
@@ -46,22 +46,25 @@ class Marks:
 
 
 BELL = np.linspace(-2.4, 2.4, 17)
-"""Where the bell across a line is laid down, in sigmas."""
+"""Where the bell across a line is laid down, in sigmas: with steps below a sigma its sum is that
+of the bell to a millionth."""
+APART = 1
+"""Samples are laid down about so many cells apart along their lines."""
 WIDEST = 1.2
 """Larger sigmas (m) are taken as that: wider bells say nothing and cost most."""
 PAD = 34
 """Cells around a field that bells of samples in it, or just beside it, may reach."""
-PART = 8192
+PART = 4096
 """Samples that are laid down together: what they need stays in the processor's cache."""
 
 
 def deposits(marks: Marks, start: Int, width: int, height: int) -> Array:
     """Line samples, each N(0, sigma²) across its line, summed by cell: (rows y, columns x).
 
-    Samples farther apart than a cell are repeated along their tangents.
+    Samples farther apart than `APART` cells are repeated along their tangents.
     """
     spacing, tangent = marks.spacing, marks.tangent / CELL
-    repeat = np.maximum(np.ceil(spacing / CELL), 1).astype(np.int64)
+    repeat = np.maximum(np.ceil(spacing / (APART * CELL)), 1).astype(np.int64)
     row = np.repeat(np.arange(len(spacing)), repeat)
     k = np.arange(len(row)) - np.repeat(np.cumsum(repeat) - repeat, repeat)
     shift = ((k + 0.5) / repeat[row] - 0.5) * spacing[row]
@@ -69,32 +72,25 @@ def deposits(marks: Marks, start: Int, width: int, height: int) -> Array:
     y = marks.xy[row, 1] / CELL + shift * tangent[row, 1] - start[1]
     side = PAD / 2
     near = (x > -side) & (y > -side) & (x < width + side) & (y < height + side)
-    row, x, y = row[near], x[near] + PAD, y[near] + PAD
-    sigma = np.clip(marks.sigma, CELL, WIDEST)
+    row = row[near]
     # Single precision places a sample to a thousandth of a cell, in half the memory.
-    x, y = x.astype(np.float32), y.astype(np.float32)
-    ax = (-sigma * tangent[:, 1])[row].astype(np.float32)
-    ay = (sigma * tangent[:, 0])[row].astype(np.float32)
-    bell = np.exp(-0.5 * BELL**2)
+    x, y = (x[near] + PAD).astype(np.float32), (y[near] + PAD).astype(np.float32)
+    sigma = np.clip(marks.sigma, CELL, WIDEST)
+    ax = (-sigma * tangent[:, 1]).astype(np.float32)[row]
+    ay = (sigma * tangent[:, 0]).astype(np.float32)[row]
     share = (marks.score * spacing / repeat)[row]
+    bell = np.exp(-0.5 * BELL**2)
+    bell /= bell.sum() * CELL**2
+    u = BELL.astype(np.float32)[:, None]
     columns, rows = width + 2 * PAD, height + 2 * PAD
-    index, mass = np.empty((len(BELL), len(row)), np.int64), np.empty((len(BELL), len(row)))
+    out = np.zeros(rows * columns)
     for first in range(0, len(row), PART):
         z = slice(first, first + PART)
-        for j, u in enumerate(BELL.astype(np.float32)):
-            # What is not negative is cut off as floor does.
-            cx, cy = (x[z] + u * ax[z]).astype(np.int32), (y[z] + u * ay[z]).astype(np.int32)
-            index[j, z] = cy * np.int32(columns) + cx
-            np.multiply(share[z], bell[j] / bell.sum() / CELL**2, out=mass[j, z])
-    out = np.bincount(index.ravel(), mass.ravel(), rows * columns).astype(np.float64, copy=False)
+        # What is not negative is cut off as floor does.
+        cx, cy = (x[z] + u * ax[z]).astype(np.int32), (y[z] + u * ay[z]).astype(np.int32)
+        index = (cy * np.int32(columns) + cx).astype(np.intp)
+        np.add.at(out, index.ravel(), (bell[:, None] * share[z]).ravel())
     return out.reshape(rows, columns)[PAD : PAD + height, PAD : PAD + width]
-
-
-def _coarse_views(coarse: Int, traversal: Traversal) -> Array:
-    """(n,) frames of a drive that could see the middles of coarse squares (n, 2)."""
-    middle = np.asarray((coarse + 0.5) * COARSE * CELL, np.float64)
-    seen = views(middle, traversal.pose, traversal.range_m, traversal.occluders, margin=1.0)
-    return np.bincount(seen.point, minlength=len(coarse)).astype(np.float64)
 
 
 def blocks(
@@ -106,55 +102,59 @@ def blocks(
     negligible σ would be infinitely high, with σ it is 1 / (√(2π) σ).
     """
     side, room = BLOCK * CELL, MARGIN * CELL
-    where = np.concatenate([d.xy for d in drives]) if drives else np.zeros((0, 2))
-    used = np.unique(np.floor(where / side).astype(np.int64) @ np.array([1 << 32, 1]))
-    for key in used:
+    looked = [t.outlook.counted(VIEW_MARGIN) for t in traversals]
+    marks = _per_view(drives, traversals, looked)
+    if not len(marks.score):
+        return
+    px, py = np.ascontiguousarray(marks.xy.T)
+    used = np.unique((np.floor(px / side).astype(np.int64) << 32) + np.floor(py / side).astype(int))
+    for packed in used.tolist():
         # The low half of the key is signed.
-        y = int((key + (1 << 31)) % (1 << 32)) - (1 << 31)
-        block = np.array([(int(key) - y) >> 32, y])
-        low, high = block * side - room, (block + 1) * side + room
-        near = [d.select(((d.xy >= low) & (d.xy < high)).all(axis=1)) for d in drives]
-        places = np.concatenate([d.xy for d in near])
+        x = (packed + (1 << 31)) >> 32
+        block = np.array([x, packed - (x << 32)])
+        low = block * side - room
+        high = low + side + 2 * room
+        inside = (px >= low[0]) & (px < high[0]) & (py >= low[1]) & (py < high[1])
+        near = marks.select(np.flatnonzero(inside))
         # Only the part of the block that holds anything, with room for the kernels.
-        first = np.maximum(places.min(axis=0) - room, low)
-        last = np.minimum(places.max(axis=0) + room, high)
+        first = np.maximum(near.xy.min(axis=0) - room, low)
+        last = np.minimum(near.xy.max(axis=0) + room, high)
         start = np.floor(first / CELL).astype(np.int64)
-        shape = np.ceil(last / CELL).astype(np.int64) - start
-        yield block, start, _mean_field(near, traversals, start, shape)
+        width, height = (np.ceil(last / CELL).astype(np.int64) - start).tolist()
+        field = deposits(near, start, width, height)
+        yield block, start, field / _looks_at(traversals, looked, start, width, height)
 
 
-def _mean_field(
-    drives: list[Marks], traversals: Sequence[Traversal], start: Int, shape: Int
+def _trust(looked: Array) -> Array:
+    """How much of a vote a drive has at cells that so many of its frames could see."""
+    return np.clip((looked - 1) / 3, 0, 1)
+
+
+def _per_view(
+    drives: Sequence[Marks], traversals: Sequence[Traversal], looked: Sequence[Array]
+) -> Marks:
+    """The marks of all drives, their scores divided by the frames that could see them: what they
+    sum up to is the mean over the frames of one drive, times its vote."""
+    parts = []
+    for marks, traversal, number in zip(drives, traversals, looked, strict=True):
+        frames = number[traversal.outlook.cells(marks.xy)]
+        score = marks.score * _trust(frames) / np.maximum(frames, 2.0)
+        parts.append(replace(marks, score=score))
+    names = Marks.__dataclass_fields__
+    return Marks(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+
+
+def _looks_at(
+    traversals: Sequence[Traversal], looked: Sequence[Array], start: Int, width: int, height: int
 ) -> Array:
-    """Mean over the drives of deposits per view, (rows y, columns x)."""
-    width, height = int(shape[0]), int(shape[1])
-    fields = [
-        deposits(marks, start, width, height) if len(marks.score) else None for marks in drives
-    ]
-    coarse_shape = (height // COARSE + 2, width // COARSE + 2)
-    base = start // COARSE
-    # The squares of the grid need not start with the field: what is left over is cut.
-    cut = start - base * COARSE
-    # Views matter where anything was found only.
-    some = np.zeros((coarse_shape[0] * COARSE, coarse_shape[1] * COARSE), bool)
-    inner = some[cut[1] : cut[1] + height, cut[0] : cut[0] + width]
-    for field in fields:
-        if field is not None:
-            inner |= field > 0
-    used = np.argwhere(some.reshape(coarse_shape[0], COARSE, coarse_shape[1], COARSE).any((1, 3)))
-    total = np.zeros((height, width))
-    weight = np.zeros(coarse_shape)
-    for field, traversal in zip(fields, traversals, strict=True):
-        looked = np.zeros(coarse_shape)
-        looked[used[:, 0], used[:, 1]] = _coarse_views(used[:, ::-1] + base, traversal)
-        trust = np.clip((looked - 1) / 3, 0, 1)
-        weight += trust
-        if field is not None:
-            total += field * _fine(trust / np.maximum(looked, 2.0), cut, height, width)
-    return total / np.maximum(_fine(weight, cut, height, width), 0.5)
-
-
-def _fine(coarse: Array, cut: Int, height: int, width: int) -> Array:
-    """A coarse grid repeated to cells, without the ``cut`` cells before the field."""
-    fine = np.repeat(np.repeat(coarse, COARSE, axis=0), COARSE, axis=1)
-    return fine[cut[1] : cut[1] + height, cut[0] : cut[0] + width]
+    """(rows y, columns x) votes of all drives at the cells of a field, at least half a one."""
+    column, row = ((start[k] + np.arange(n) + 0.5) * CELL for k, n in ((0, width), (1, height)))
+    # The cells of views are larger than those of the field: each is asked about once.
+    x, x_of = np.unique(np.floor(column / VIEW_CELL), return_inverse=True)
+    y, y_of = np.unique(np.floor(row / VIEW_CELL), return_inverse=True)
+    places = (np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) + 0.5) * VIEW_CELL
+    total = np.zeros(len(places))
+    for traversal, number in zip(traversals, looked, strict=True):
+        total += _trust(number[traversal.outlook.cells(places)])
+    out: Array = np.maximum(total, 0.5).reshape(len(y), len(x))[y_of][:, x_of]
+    return out

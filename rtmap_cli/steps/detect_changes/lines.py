@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.logs.traversal import Traversal, pose_variance
-from rtmap_cli.maps.assignment import across_sigma, assign_once
+from rtmap_cli.maps.assignment import assign_once
 from rtmap_cli.maps.refit import (
     FusionModel,
     combine,
@@ -22,7 +22,6 @@ from rtmap_cli.maps.stations import (
     Stations,
     assign,
     loose_stretches,
-    samples_of,
     smoother,
     stations_of,
 )
@@ -53,17 +52,6 @@ CORNER = {"boundary": 5.0}
 """Longest extension (m) of two ends to a common corner."""
 
 
-def class_samples(traversal: Traversal, class_name: str) -> Samples:
-    """Samples of a drive's detections of one class in the map frame."""
-    index = np.flatnonzero(traversal.class_name == class_name)
-    return samples_of(
-        traversal.points[index],
-        traversal.covariance[index],
-        traversal.score[index],
-        traversal.frame[index],
-    )
-
-
 def new_lines(
     class_name: str,
     prior: Stations,
@@ -75,7 +63,7 @@ def new_lines(
     for s in samples:
         _, taken = assign_once(prior, s)
         k = loose_stretches(s, taken, SHORTEST)
-        drives.append(Marks(s.xy[k], s.tangent[k], s.spacing[k], across_sigma(s)[k], s.score[k]))
+        drives.append(Marks(s.xy[k], s.tangent[k], s.spacing[k], s.across_sigma[k], s.score[k]))
     widths = np.concatenate([d.sigma for d in drives])
     if not len(widths):
         return []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from rtmap_cli.maps.existence import (
     joint_log_likelihoods,
     log_odds_of,
 )
+from rtmap_cli.maps.outlook import Outlook
 from rtmap_cli.maps.sight import Look, SightModel, measured_sight
 from rtmap_cli.maps.stations import STEP, Feet, Samples, Stations
 from rtmap_cli.maps.visibility import Views, views
@@ -35,15 +37,49 @@ SURE_NO, SURE_YES = 0.15, 0.85
 """… nor does an existence up to the first; from the second on the network is sure."""
 
 
+class Looks(Protocol):
+    """Which frames could see places."""
+
+    def frames(self, index: Int) -> Int:
+        """Of the places ``index`` the frames that could see them, once for each place."""
+
+
+@dataclass(frozen=True)
+class PairLooks:
+    """Every view: its ``place`` and its ``frame`` (k,)."""
+
+    place: Int
+    frame: Int
+
+    def frames(self, index: Int) -> Int:
+        """Of the places ``index`` the frames that could see them, once for each place."""
+        mine = np.zeros(int(self.place.max(initial=-1)) + 1, bool)
+        mine[index[index < len(mine)]] = True
+        return self.frame[mine[self.place]]
+
+
+@dataclass(frozen=True)
+class CellLooks:
+    """Views by cells: the ``cell`` (n,) of each place in the drive's ``outlook``, and the
+    ``margin`` (m) of its range that does not count."""
+
+    outlook: Outlook
+    cell: Int
+    margin: float
+
+    def frames(self, index: Int) -> Int:
+        """Of the places ``index`` the frames that could see them, once for each place."""
+        return self.outlook.frames(self.cell[index], self.margin)
+
+
 @dataclass(frozen=True)
 class DriveCounts:
-    """One drive at n places: fractional ``hits`` of weighted ``views``. Of every view its
-    ``view_place`` and ``view_frame``, of every hit ``hit_place``, ``hit_frame``, ``hit_score``."""
+    """One drive at n places: fractional ``hits`` of weighted ``views``, the ``looks`` behind these;
+    of every hit ``hit_place``, ``hit_frame``, ``hit_score``."""
 
     hits: Array
     views: Array
-    view_place: Int
-    view_frame: Int
+    looks: Looks
     hit_place: Int
     hit_frame: Int
     hit_score: Array
@@ -69,25 +105,30 @@ def count(n: int, seen: Views, weight: Array, key: Int, value: Array, score: Arr
     margin, or seen past an occluder) do not count: neither would a miss have.
     """
     view_key = seen.frame * n + seen.point
-    order = np.lexsort((-value, key))
-    key, value, score = key[order], value[order], score[order]
-    first = np.ones(len(key), bool)
-    first[1:] = key[1:] != key[:-1]
-    key, value, score = key[first], value[first], score[first]
-    at = np.searchsorted(view_key, key)
-    at = np.minimum(at, max(len(view_key) - 1, 0))
+    key, value, score = _best_hits(key, value, score)
+    at = np.minimum(np.searchsorted(view_key, key), max(len(view_key) - 1, 0))
     ok = view_key[at] == key if len(view_key) else np.zeros(len(key), bool)
-    at, value, score = at[ok], value[ok], score[ok]
-    place = seen.point[at]
-    return DriveCounts(
-        np.bincount(place, value, n).astype(np.float64),
-        np.bincount(seen.point, weight, n).astype(np.float64),
-        seen.point,
-        seen.frame,
-        place,
-        seen.frame[at],
-        score,
-    )
+    views_ = np.bincount(seen.point, weight, n).astype(np.float64)
+    return _counted(n, PairLooks(seen.point, seen.frame), views_, key[ok], value[ok], score[ok])
+
+
+def _best_hits(key: Int, value: Array, score: Array) -> tuple[Int, Array, Array]:
+    """The keys once, in order, each with its best value and score."""
+    if not len(key):
+        return key, value, score
+    order = np.argsort(key)
+    key = key[order]
+    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+    best = [np.maximum.reduceat(v[order], first) for v in (value, score)]
+    return key[first], best[0], best[1]
+
+
+def _counted(
+    n: int, looked: Looks, views_: Array, key: Int, value: Array, score: Array
+) -> DriveCounts:
+    frame, place = np.divmod(key, n)
+    hits = np.bincount(place, value, n).astype(np.float64)
+    return DriveCounts(hits, views_, looked, place, frame, score)
 
 
 def looks(stations: Stations, traversal: Traversal, margin: float) -> tuple[Views, Look]:
@@ -111,6 +152,8 @@ def sight_of(
 ) -> SightModel:
     """How well the drives see lines, measured on those of the map that they confirm."""
     n, parts, found = len(stations), [], []
+    if not n:
+        return SightModel()
     for traversal, s, own in zip(traversals, samples, feet, strict=True):
         seen, look = looks(stations, traversal, margin)
         near = [np.clip(own.station + k, 0, n - 1) for k in (-1, 0, 1)]
@@ -135,9 +178,9 @@ def line_counts(
     sight: SightModel,
 ) -> DriveCounts:
     """Counts of one drive at the stations of lines with element ``ids`` (one per line)."""
-    n = len(stations)
-    seen, look = looks(stations, traversal, margin)
-    weight = sight.weight(look)
+    n, outlook = len(stations), traversal.outlook
+    cell = outlook.cells(stations.xy)
+    views_ = outlook.counted(margin, sight)[cell] * sight.curve("to_end", stations.to_end)
     keys, values, scores = [], [], []
     frame, score = samples.frame[feet.sample], samples.score[feet.sample]
     value = detection_value(score)
@@ -154,7 +197,11 @@ def line_counts(
     keys.append(asked_key)
     values.append(answer_value(existence))
     scores.append(existence)
-    return count(n, seen, weight, *map(np.concatenate, (keys, values, scores)))
+    key, value, score = _best_hits(*map(np.concatenate, (keys, values, scores)))
+    at, place = np.divmod(key, n)
+    ok = outlook.sees(at, cell[place], margin)
+    looked = CellLooks(outlook, cell, margin)
+    return _counted(n, looked, views_, key[ok], value[ok], score[ok])
 
 
 def _asked_stations(
@@ -232,19 +279,19 @@ class Ballot:
         """What one drive says about the places ``index``; a frame speaks for them when it found
         or could see half of what any frame of the drive did."""
         drive, time = self.drives[k], self.times[k]
+        if not drive.views[index].any():
+            return None
         mine = np.zeros(self.votes.shape[-1], bool)
         mine[index] = True
-        looked, found = mine[drive.view_place], mine[drive.hit_place]
-        if not looked.any():
-            return None
-        view_frames = _mostly(drive.view_frame[looked])
-        hit_frames = np.intersect1d(_mostly(drive.hit_frame[found]), view_frames)
+        found = mine[drive.hit_place]
+        view_frames = _mostly(drive.looks.frames(index), len(time))
+        hit_frames = np.flatnonzero(_mostly(drive.hit_frame[found], len(time)) & view_frames)
         score = drive.hit_score[found]
         odds = log_odds_of(self.votes[k][:, index], self.model)
         return DriveEvidence(
             self.runs[k],
             int(time[0]),
-            len(view_frames),
+            int(view_frames.sum()),
             len(hit_frames),
             tuple(int(t) for t in time[hit_frames]),
             float(score.mean()) if len(score) else None,
@@ -254,21 +301,31 @@ class Ballot:
         )
 
 
-def _mostly(frames: Int) -> Int:
-    """The frames that occur at least half as often as the commonest one."""
-    values, number = np.unique(frames, return_counts=True)
-    return values[2 * number >= number.max()] if len(values) else values
+def _mostly(frames: Int, count: int) -> Mask:
+    """(count,) the frames that occur at least half as often as the commonest one."""
+    number = np.bincount(frames, minlength=count)
+    return (number > 0) & (2 * number >= number.max())
+
+
+@dataclass(frozen=True)
+class _LaterLooks:
+    """Views of the places from ``first`` on."""
+
+    looks: Looks
+    first: int
+
+    def frames(self, index: Int) -> Int:
+        """Of the places ``index`` the frames that could see them, once for each place."""
+        return self.looks.frames(index[index >= self.first])
 
 
 def _without(drive: DriveCounts, old: int) -> DriveCounts:
     """The counts of a drive with nothing at the first ``old`` places."""
-    mask = np.arange(len(drive.hits)) >= old
-    view, hit = drive.view_place >= old, drive.hit_place >= old
+    mask, hit = np.arange(len(drive.hits)) >= old, drive.hit_place >= old
     return DriveCounts(
         drive.hits * mask,
         drive.views * mask,
-        drive.view_place[view],
-        drive.view_frame[view],
+        _LaterLooks(drive.looks, old),
         drive.hit_place[hit],
         drive.hit_frame[hit],
         drive.hit_score[hit],

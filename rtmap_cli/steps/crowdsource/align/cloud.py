@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.keys import packed
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.stations import samples_of
 
@@ -63,9 +64,7 @@ def cloud_of(traversals: Sequence[Traversal], first: Int) -> Cloud:
         index = np.flatnonzero(t.score >= MIN_SCORE)
         s = samples_of(t.points[index], t.covariance[index], t.score[index], t.frame[index])
         p = t.pose[s.frame]
-        normal = np.stack([-s.tangent[:, 1], s.tangent[:, 0]], axis=-1)
-        variance = np.einsum("ni,nij,nj->n", normal, s.covariance, normal)
-        variance = np.maximum(variance, 0.01)
+        variance = np.maximum(s.across_sigma**2, 0.01)
         step = np.hypot(*np.diff(t.pose[:, :2], axis=0, append=t.pose[-1:, :2]).T)
         each = 2 * t.points.shape[1] - 1
         kind = np.repeat(np.searchsorted(names, t.class_name[index].astype(str)), each)
@@ -85,16 +84,18 @@ def blocks_of(xy: Array, margin: float) -> Iterator[tuple[Array, Int, Int]]:
     """Yield the low corner of each block, the points in it and those within ``margin`` (m) of it,
     its own included (indices into ``xy``)."""
     key = np.floor(xy / SIDE).astype(np.int64)
-    values, inverse = np.unique(key, axis=0, return_inverse=True)
-    order = np.argsort(inverse.ravel(), kind="stable")
-    ends = np.cumsum(np.bincount(inverse.ravel(), minlength=len(values)))
+    _, first, inverse = np.unique(packed(*key.T), return_index=True, return_inverse=True)
+    values = key[first]
+    order = np.argsort(inverse, kind="stable")
+    ends = np.cumsum(np.bincount(inverse, minlength=len(values)))
     rows = {tuple(v): order[e - n : e] for v, e, n in _spans(values, ends)}
     for (i, j), own in rows.items():
         near = [rows[k] for a in (-1, 0, 1) for b in (-1, 0, 1) if (k := (i + a, j + b)) in rows]
         around = np.concatenate(near)
         low = np.array([i, j]) * SIDE
-        p = xy[around]
-        inside = ((p >= low - margin) & (p < low + SIDE + margin)).all(axis=1)
+        x, y = xy[around, 0] - low[0], xy[around, 1] - low[1]
+        far = SIDE + margin
+        inside = (x >= -margin) & (x < far) & (y >= -margin) & (y < far)
         yield low, own, around[inside]
 
 
@@ -119,12 +120,11 @@ class Grid:
 
     def field(self, cells: Int, kind: Int, angle: Array, weight: Array, kinds: int) -> Array:
         """(kinds, 3, size, size) sums of the channels, not blurred."""
-        flat = (kind * 3 * self.size + cells[:, 0]) * self.size + cells[:, 1]
         plane = self.size * self.size
-        channels = (weight, weight * np.cos(2 * angle), weight * np.sin(2 * angle))
-        out = np.zeros(kinds * 3 * plane)
-        for c, value in enumerate(channels):
-            out += np.bincount(flat + c * plane, value, len(out))
+        flat = kind * plane + cells[:, 0] * self.size + cells[:, 1]
+        out = np.empty((kinds, 3, plane))
+        for c, along in enumerate((np.ones_like(angle), np.cos(2 * angle), np.sin(2 * angle))):
+            out[:, c] = np.bincount(flat, weight * along, kinds * plane).reshape(kinds, plane)
         return out.reshape(kinds, 3, self.size, self.size)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.keys import packed
 from rtmap_cli.logs.motion import Motion, motion_terms
 from rtmap_cli.steps.crowdsource.align.cloud import SIDE, Cloud, Grid, blocks_of, blurred
 
@@ -61,14 +62,19 @@ def pulls(cloud: Cloud, pose: Array, reach: float) -> Pull:
             ),
             blur / CELL,
         )
-        c2, s2 = np.cos(2 * angle[own]), np.sin(2 * angle[own])
-        normal = np.stack([-np.sin(angle[own]), np.cos(angle[own])], axis=-1)
+        a = angle[own]
+        c2, s2 = np.cos(2 * a), np.sin(2 * a)
+        x, y = ((xy[own, k] - grid.low[k]) / CELL for k in (0, 1))
+        across, up = -np.sin(a) / CELL, np.cos(a) / CELL
+        flat, plane = field.ravel(), size * size
+        base = cloud.kind[own] * (3 * plane)
         total, moment = np.zeros(len(own)), np.zeros(len(own))
         for step, share in zip(u, bell, strict=True):
-            at = grid.cells(xy[own] + step * normal)
-            k, (row, column) = cloud.kind[own], at.T
-            f = field[k, 0, row, column] + c2 * field[k, 1, row, column]
-            f = np.maximum(f + s2 * field[k, 2, row, column], 0.0) * share
+            # The margin is wider than the bell: no step leaves the grid.
+            row, column = (y + step * up).astype(np.int64), (x + step * across).astype(np.int64)
+            at = base + row * size + column
+            f = flat[at] + c2 * flat[at + plane] + s2 * flat[at + 2 * plane]
+            f = np.maximum(f, 0.0) * share
             total += f
             moment += step * f
         seen[own] = total > 0
@@ -81,10 +87,10 @@ def pulls(cloud: Cloud, pose: Array, reach: float) -> Pull:
 def company(cloud: Cloud, xy: Array, cell: float = 2.0) -> Array:
     """(n,) share of the other drives in what was seen of a class around each point."""
     place = np.floor(xy / cell).astype(np.int64)
-    _, key = np.unique(np.column_stack([place, cloud.kind]), axis=0, return_inverse=True)
-    drives = int(cloud.drive.max()) + 1
-    _, own = np.unique(key.ravel() * drives + cloud.drive, return_inverse=True)
-    total = np.bincount(key.ravel(), cloud.weight)[key.ravel()]
+    name = packed(*place.T, cloud.kind)
+    _, key = np.unique(name, return_inverse=True)
+    _, own = np.unique(packed(name, cloud.drive), return_inverse=True)
+    total = np.bincount(key, cloud.weight)[key]
     mine = np.bincount(own, cloud.weight)[own]
     out: Array = 1.0 - mine / total
     return out
@@ -94,9 +100,7 @@ def _votes(cloud: Cloud, xy: Array, angle: Array) -> Array:
     """(n,) information (1/m²) of each point: those of a drive at a place are one vote."""
     place = np.floor(xy / PLACE).astype(np.int64)
     turn = np.floor((angle % np.pi) / (np.pi / 4) + 0.5).astype(np.int64) % 4
-    name = np.column_stack([cloud.drive, cloud.kind, turn, place])
-    _, key = np.unique(name, axis=0, return_inverse=True)
-    key = key.ravel()
+    _, key = np.unique(packed(cloud.drive, cloud.kind, turn, *place.T), return_inverse=True)
     weight = cloud.weight / cloud.variance
     total = np.bincount(key, weight)
     variance = DRIVE_SHARE * np.bincount(key, weight * cloud.variance) / total + FLOOR**2

@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.keys import packed
 from rtmap_cli.steps.crowdsource.align.cloud import SIDE, Cloud, Grid, blocks_of, blurred
 
 Array = NDArray[np.float64]
@@ -26,8 +27,6 @@ GAIN = 30.0
 """Log-likelihood that a stretch loses when nothing of it meets the others."""
 CHANGE = 0.5
 """Sigma (m) of the change of the shift from one stretch to the next."""
-MOST = 4000
-"""Points of a drive that are compared in a block, at most."""
 
 
 def stretches_of(pose: Array, first: Int) -> Int:
@@ -68,33 +67,39 @@ def surfaces(cloud: Cloud, pose: Array, stretch: Int, blur: float) -> Array:
         }
         if len(fields) < 2:
             continue
-        total = np.sum(list(fields.values()), axis=0)
+        total = sum(fields.values(), np.zeros((kinds, 3, size, size)))
         for d, field in fields.items():
             index = own[cloud.drive[own] == d]
-            index = index[:: max(1, len(index) // MOST)]
             if not len(index):
                 continue
             others = blurred(total - field, blur / CELL)
-            at = grid.cells(xy[index])
-            value = _patches(others, at, cloud.kind[index], angle[index], lags)
-            weight = cloud.weight[index] * max(1, (cloud.drive[own] == d).sum() / len(index))
-            which = stretch[cloud.frame[index]]
-            order = np.argsort(which, kind="stable")
-            found, start = np.unique(which[order], return_index=True)
-            value = (weight[:, None, None] * value)[order]
-            out[found] += np.add.reduceat(value, start, axis=0)
+            place = grid.cells(xy[index]), cloud.kind[index]
+            _add_agreement(
+                out, others, place, stretch[cloud.frame[index]], angle[index], cloud.weight[index]
+            )
     return out
 
 
-def _patches(field: Array, at: Int, kind: Int, angle: Array, lags: Int) -> Array:
-    """(n, lags, lags) of the field along ``angle`` around cells ``at``."""
-    rows = (at[:, 0, None] + lags)[:, :, None]
-    columns = (at[:, 1, None] + lags)[:, None, :]
-    k = kind[:, None, None]
-    c, s = np.cos(2 * angle)[:, None, None], np.sin(2 * angle)[:, None, None]
-    out: Array = field[k, 0, rows, columns]
-    out = out + c * field[k, 1, rows, columns] + s * field[k, 2, rows, columns]
-    return out
+def _add_agreement(
+    out: Array, field: Array, place: tuple[Int, Int], stretch: Int, angle: Array, weight: Array
+) -> None:
+    """Add to ``out`` (stretches, lags, lags) how much of ``field`` lies along points at all lags.
+
+    ``place``: cell (n, 2) and kind (n,) of each point. What a stretch has in a cell is summed up
+    first: frames one after the other see the same.
+    """
+    (cell, kind), size = place, field.shape[-1]
+    name = packed(stretch, kind, cell[:, 0], cell[:, 1])
+    _, first, owner = np.unique(name, return_index=True, return_inverse=True)
+    windows = np.lib.stride_tricks.sliding_window_view(field, (2 * LAGS + 1,) * 2, axis=(2, 3))
+    row, column = (np.clip(cell[first, k] - LAGS, 0, size - 2 * LAGS - 1) for k in (0, 1))
+    which = stretch[first]
+    ends = np.flatnonzero(np.append(which[1:] != which[:-1], True)) + 1
+    for c, along in enumerate((np.ones_like(angle), np.cos(2 * angle), np.sin(2 * angle))):
+        mass = np.bincount(owner, weight * along, len(first))
+        for a, b in pairwise([0, *ends.tolist()]):
+            part = windows[kind[first[a:b]], c, row[a:b], column[a:b]].reshape(b - a, -1)
+            out[which[a]] += (mass[a:b] @ part).reshape(out.shape[1:])
 
 
 def best_shifts(surface: Array, sigma: Array, before: Array) -> Array:

@@ -1,0 +1,21 @@
+"""Rows of whole numbers as one number each: sorting those is many times faster."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Int = NDArray[np.int64]
+
+
+def packed(*columns: NDArray[np.integer]) -> Int:
+    """(n,) one number per row of the columns (n,), ordered as the rows are.
+
+    The ranges of the columns, multiplied, must stay below 2⁶³.
+    """
+    out = np.zeros(len(columns[0]), np.int64)
+    for column in columns:
+        if len(column):
+            low = int(column.min())
+            out = out * (int(column.max()) - low + 1) + (column - low)
+    return out
