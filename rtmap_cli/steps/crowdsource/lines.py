@@ -28,6 +28,8 @@ NEW_SIGMA = 1.0
 """Standard deviation (m) of a new line's vertices before its detections are fused."""
 END_SIGMA = 0.8
 """Along-line standard deviation (m) of an open end: detections are cut short there."""
+MET = 0.02
+"""Ends so near to each other (m) are one vertex."""
 OVERLAP = 0.3
 """A new line that is joined to an end starts so far (m) beyond it."""
 LONGEST_MOVE = 1.0
@@ -193,11 +195,14 @@ def snap_ends(points: list[Array], new: Sequence[bool], reach: float, angle: flo
         outward += [-t[0], t[-1]]
     if len(owner) < 2:
         return
+    tree = cKDTree(np.array(place))
+    met = np.array([len(k) > 1 for k in tree.query_ball_point(place, MET)])
     options = []
-    for i, j in cKDTree(np.array(place)).query_pairs(reach):
+    for i, j in tree.query_pairs(reach):
         # An old end keeps its place; of two new ends the first one moves.
         a, b = (i, j) if new[owner[i][0]] else (j, i)
-        if owner[a][0] == owner[b][0] or not new[owner[a][0]]:
+        # Where two lines have met already there is no gap to close.
+        if owner[a][0] == owner[b][0] or not new[owner[a][0]] or met[b]:
             continue
         if -(outward[a] @ outward[b]) >= np.cos(angle):
             options.append((float(np.hypot(*(place[a] - place[b]))), a, b))
