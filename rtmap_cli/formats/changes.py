@@ -84,15 +84,18 @@ def write_changes(
     members = {
         "rtmap": {"schema": CHANGES_SCHEMA, "schema_version": CHANGES_VERSION} | (info or {})
     }
-    write_features([_feature(c, crs) for c in changes], path, members)
+    # In every feature too: editors drop the members of a collection.
+    version = (info or {}).get("map_version")
+    own = {} if version is None else {"map_version": version}
+    write_features([_feature(c, crs, own) for c in changes], path, members)
 
 
-def _feature(change: ChangeEvent, crs: str) -> dict[str, Any]:
+def _feature(change: ChangeEvent, crs: str, own: dict[str, Any]) -> dict[str, Any]:
     closed = change.class_name in RING_CLASSES and len(change.points) > 3
     points = change.points
     if closed and not counter_clockwise(points):
         points = points[::-1]
-    return feature(points, crs, closed, change.properties())
+    return feature(points, crs, closed, change.properties() | own)
 
 
 def write_change_table(changes: Sequence[ChangeEvent], path: str | Path, crs: str) -> None:
