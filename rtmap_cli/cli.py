@@ -16,6 +16,7 @@ COMMANDS: dict[str, Any] = {
     "infer": ("infer", "Read a log with the network: observations of every frame."),
     "localize": ("localize", "Find where each frame stands on the prior map."),
     "detect-changes": ("detect_changes", "Tell what is gone and what is new."),
+    "update": ("update", "Flag the cells of a map that predictions contradict."),
     "crowdsource": ("crowdsource", "Fuse runs into the next version of the map."),
     "evaluate": (
         "Compare with ground truth.",

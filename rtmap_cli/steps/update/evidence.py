@@ -1,0 +1,176 @@
+"""What each drive says about a stretch: frames that had it in view, frames that found it, a vote.
+
+A drive's vote is the log-likelihood ratio of its frames under "the line is there" (found at the
+usual rate of the class, or at a quarter of it: some places are always hard to see) and "it is not"
+(found now and then); frames of one drive are alike, so that they count as a few and the vote
+saturates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.blocks import points_along
+from rtmap_cli.geometry.polylines import resample_step
+from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.element import RING_CLASSES, Element
+from rtmap_cli.maps.evidence import Counts, DriveEvidence
+from rtmap_cli.maps.visibility import views
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+STEP = 2.0
+"""Metres between the places of a stretch that are looked at."""
+NEAR = 1.0
+"""A detection within so much (m) of a line found it."""
+RING_NEAR = 3.0
+"""... of the centre of an outline."""
+HALF = 0.5
+"""Share of a stretch that must be in view, and of what is in view that must be found."""
+FRAMES = 6.0
+"""Frames of one drive count as so many at most: they are alike."""
+FALSE_RATE = 0.05
+"""How often frames find what is not there."""
+HARD, HARD_SHARE = 0.25, 0.15
+"""Share of places that are hard to see, and of the usual rate at which they are found."""
+SATURATED = 3.0
+"""No drive says more (log-odds)."""
+SAMPLE = 60
+"""Stretches of old elements whose rate of being found is the usual one."""
+
+
+@dataclass(frozen=True)
+class Detected:
+    """The detections of one drive and class for look-ups: a KD-tree over x, y and frame."""
+
+    traversal: Traversal
+    tree: object
+    row: Int
+
+    @staticmethod
+    def of(traversal: Traversal, class_name: str) -> Detected:
+        """Points along the lines of a class, or the middles of its outlines."""
+        from scipy.spatial import cKDTree
+
+        mine = np.flatnonzero(traversal.class_name == class_name)
+        if class_name in RING_CLASSES:
+            which, xy = np.arange(len(mine)), traversal.points[mine][:, :-1].mean(axis=1)
+        else:
+            which, xy, _ = points_along(traversal.points[mine], NEAR)
+        frame = traversal.frame[mine[which]]
+        return Detected(traversal, cKDTree(_lifted(xy.reshape(-1, 2), frame)), mine[which])
+
+    def found(self, xy: Array, frame: Int, near: float) -> tuple[NDArray[np.bool_], Int]:
+        """Whether some detection of its frame lies within ``near`` metres of each point (n, 2), and
+        its row."""
+        if not len(self.row):
+            return np.zeros(len(xy), bool), np.zeros(len(xy), np.int64)
+        far, at = self.tree.query(_lifted(xy, frame), distance_upper_bound=near)  # type: ignore[attr-defined]
+        return np.isfinite(far), self.row[np.minimum(at, len(self.row) - 1)]
+
+
+def _lifted(xy: Array, frame: Int) -> Array:
+    """Points with their frame as a third axis: those of other frames are far away."""
+    return np.column_stack([xy, frame * 1000.0])
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Frames of one drive that had a stretch in view (``times``, ns), which of them ``found`` it,
+    and the mean score of what they found (None: nothing)."""
+
+    run_id: str
+    times: Int
+    found: NDArray[np.bool_]
+    score: float | None
+    first_ns: int
+
+
+def seen_of(
+    points: Array, class_name: str, drives: Sequence[Detected], margin: float, near: float = NEAR
+) -> list[Seen]:
+    """What each drive saw of a stretch (n, 2) in the map frame."""
+    ring = class_name in RING_CLASSES
+    places = points[:-1].mean(axis=0)[None] if ring else resample_step(points, STEP)
+    out = []
+    for d in drives:
+        t = d.traversal
+        pairs = views(places, t.pose, t.range_m, t.occluders, margin)
+        count = np.bincount(pairs.frame, minlength=len(t.pose))
+        hit, row = d.found(places[pairs.point], pairs.frame, RING_NEAR if ring else near)
+        hits = np.bincount(pairs.frame, hit, len(t.pose))
+        looked = np.flatnonzero(count >= max(HALF * len(places), 1))
+        found = hits[looked] >= HALF * count[looked]
+        used = hit & np.isin(pairs.frame, looked[found])
+        score = float(t.score[row[used]].mean()) if used.any() else None
+        times = t.timestamp_ns[looked]
+        out.append(Seen(t.run_id, times, found, score, int(t.timestamp_ns[0])))
+    return out
+
+
+def usual_rate(
+    elements: Sequence[Element], class_name: str, drives: Sequence[Detected], margin: float
+) -> float:
+    """How often frames find an element of a class that is there: the upper half of what is
+    measured on elements of the map, so that those which are gone do not count."""
+    rates = []
+    for e in elements[:: max(1, len(elements) // SAMPLE)]:
+        seen = seen_of(e.xy, class_name, drives, margin)
+        looks = sum(len(s.times) for s in seen)
+        if looks >= 4:
+            rates.append(sum(int(s.found.sum()) for s in seen) / looks)
+    good = [r for r in rates if r > 2 * FALSE_RATE]
+    return float(np.clip(np.median(good), 0.3, 0.95)) if good else 0.7
+
+
+def vote(found: int, looked: int, rate: float) -> float:
+    """Log-odds that a line is there, by one drive whose frames found it so often."""
+    if not looked:
+        return 0.0
+    n = min(float(looked), FRAMES)
+    k = found / looked * n
+
+    def log_likelihood(q: float) -> float:
+        return k * float(np.log(q)) + (n - k) * float(np.log(1 - q))
+
+    good = np.log(1 - HARD_SHARE) + log_likelihood(rate)
+    hard = np.log(HARD_SHARE) + log_likelihood(max(HARD * rate, 1.5 * FALSE_RATE))
+    there = float(np.logaddexp(good, hard))
+    return float(np.clip(there - log_likelihood(FALSE_RATE), -SATURATED, SATURATED))
+
+
+def counts_of(seen: Sequence[Seen], rate: float) -> Counts:
+    """All drives together, each with its vote; oldest first."""
+    looked = sorted((s for s in seen if len(s.times)), key=lambda s: (s.first_ns, s.run_id))
+    drives = []
+    for s in looked:
+        odds = vote(int(s.found.sum()), len(s.times), rate)
+        drives.append(
+            DriveEvidence(
+                s.run_id,
+                s.first_ns,
+                len(s.times),
+                int(s.found.sum()),
+                tuple(s.times[s.found].tolist()),
+                s.score,
+                odds,
+                True,
+                odds > 0,
+            )
+        )
+    times = [t for d in drives for t in d.seen_ns]
+    return Counts(
+        sum(d.frames_seen for d in drives),
+        sum(d.frames_in_view for d in drives),
+        sum(d.seen for d in drives),
+        len(drives),
+        min(times) if times else None,
+        max(times) if times else None,
+        tuple(d.run_id for d in drives if d.seen),
+        tuple(drives),
+    )
