@@ -31,11 +31,11 @@ BRIDGE = 3
 """Stations between two stretches of one kind that do not part them."""
 BEHIND = 0.75
 """Of the drives asked for, what the count behind a line must reach: drives never weigh the same."""
-MOVE = 0.6
+MOVE = 0.45
 """Lines that lie nearer (m) than this to their place in the map have not moved, however exact."""
 MOVE_SIGMAS = 4.0
 """Offsets count from so many usual ones (of the class, robustly measured) on."""
-MOVE_LENGTH = 6.0
+MOVE_LENGTH = 8.0
 PROFILE = 0.65
 """Half width (m, one sigma) of a line in the grid: what it adds to a line beside it."""
 PARALLEL = 3.0
@@ -175,7 +175,7 @@ def _lines(
             out.append(Stretch(MISSING_NEW, name, e.element_id, a.xy[run]))
     known = in_new.found
     for k in range(len(new)):
-        for run in _runs(~known, ~known, b.of_line(k), settings.shortest_m, b):
+        for run in _runs(~known, ~known, b.of_line(k), settings.new_m, b):
             part = b.xy[run]
             sure, drives = _strength(heat, name, part)
             if sure >= settings.threshold * usual and drives >= BEHIND * need:
@@ -279,6 +279,8 @@ def _moved(
                 if kept.sum() < 2:
                     continue
                 sure, drives = _strength(heat, name, points)
+                if drives < BEHIND * needed(heat, settings):
+                    continue
                 out.append(
                     Stretch(MOVED, name, e.element_id, points[kept], sure, drives, a.xy[run])
                 )

@@ -1,21 +1,22 @@
 """What each drive says about a stretch: frames that had it in view, frames that found it, a vote.
 
-A drive's vote is the log-likelihood ratio of its frames under "the line is there" (found at the
-usual rate of the class, or at a quarter of it: some places are always hard to see) and "it is not"
+A drive's vote is the log-likelihood ratio of its frames under "the line is there" and "it is not"
 (found now and then); frames of one drive are alike, so that they count as a few and the vote
-saturates.
+saturates. What is there is found at the usual rate of its class or, where it is worn or half
+hidden, at a part of it; it is worn for all drives or for none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.blocks import points_along
-from rtmap_cli.geometry.polylines import resample_step
+from rtmap_cli.geometry.polylines import normals, resample_step
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.element import RING_CLASSES, Element
 from rtmap_cli.maps.evidence import Counts, DriveEvidence
@@ -32,14 +33,16 @@ RING_NEAR = 3.0
 """... of the centre of an outline."""
 HALF = 0.5
 """Share of a stretch that must be in view, and of what is in view that must be found."""
-FRAMES = 6.0
+FRAMES = 12.0
 """Frames of one drive count as so many at most: they are alike."""
-FALSE_RATE = 0.05
+FALSE_RATE = 0.02
 """How often frames find what is not there."""
 HARD, HARD_SHARE = 0.25, 0.15
-"""Share of places that are hard to see, and of the usual rate at which they are found."""
-SATURATED = 3.0
+"""Part of the usual rate at which worn places are found, and how many places are."""
+SATURATED = 4.0
 """No drive says more (log-odds)."""
+ASIDE = 1.5
+"""Metres beside a line at which its errors look like a line of their own."""
 SAMPLE = 60
 """Stretches of old elements whose rate of being found is the usual one."""
 
@@ -49,7 +52,8 @@ class Detected:
     """The detections of one drive and class for look-ups: a KD-tree over x, y and frame."""
 
     traversal: Traversal
-    tree: object
+    tree: Any
+    xy: Array
     row: Int
 
     @staticmethod
@@ -62,16 +66,24 @@ class Detected:
             which, xy = np.arange(len(mine)), traversal.points[mine][:, :-1].mean(axis=1)
         else:
             which, xy, _ = points_along(traversal.points[mine], NEAR)
-        frame = traversal.frame[mine[which]]
-        return Detected(traversal, cKDTree(_lifted(xy.reshape(-1, 2), frame)), mine[which])
+        xy, frame = xy.reshape(-1, 2), traversal.frame[mine[which]]
+        return Detected(traversal, cKDTree(_lifted(xy, frame)), xy, mine[which])
 
-    def found(self, xy: Array, frame: Int, near: float) -> tuple[NDArray[np.bool_], Int]:
+    def found(
+        self, xy: Array, frame: Int, near: float, rivals: Any = None
+    ) -> tuple[NDArray[np.bool_], Int]:
         """Whether some detection of its frame lies within ``near`` metres of each point (n, 2), and
-        its row."""
+        its row; one that lies nearer to a line of ``rivals`` (shapely) is that line's."""
         if not len(self.row):
             return np.zeros(len(xy), bool), np.zeros(len(xy), np.int64)
-        far, at = self.tree.query(_lifted(xy, frame), distance_upper_bound=near)  # type: ignore[attr-defined]
-        return np.isfinite(far), self.row[np.minimum(at, len(self.row) - 1)]
+        far, at = self.tree.query(_lifted(xy, frame), distance_upper_bound=near)
+        hit, at = np.isfinite(far), np.minimum(at, len(self.row) - 1)
+        if rivals is not None and hit.any():
+            import shapely
+
+            other = shapely.distance(shapely.points(self.xy[at[hit]]), rivals)
+            hit[hit] = far[hit] <= other
+        return hit, self.row[at]
 
 
 def _lifted(xy: Array, frame: Int) -> Array:
@@ -92,9 +104,14 @@ class Seen:
 
 
 def seen_of(
-    points: Array, class_name: str, drives: Sequence[Detected], margin: float, near: float = NEAR
+    points: Array,
+    class_name: str,
+    drives: Sequence[Detected],
+    margin: float,
+    rivals: Any = None,
 ) -> list[Seen]:
-    """What each drive saw of a stretch (n, 2) in the map frame."""
+    """What each drive saw of a stretch (n, 2) in the map frame; ``rivals``: other lines (shapely)
+    that detections may belong to."""
     ring = class_name in RING_CLASSES
     places = points[:-1].mean(axis=0)[None] if ring else resample_step(points, STEP)
     out = []
@@ -102,7 +119,8 @@ def seen_of(
         t = d.traversal
         pairs = views(places, t.pose, t.range_m, t.occluders, margin)
         count = np.bincount(pairs.frame, minlength=len(t.pose))
-        hit, row = d.found(places[pairs.point], pairs.frame, RING_NEAR if ring else near)
+        near = RING_NEAR if ring else NEAR
+        hit, row = d.found(places[pairs.point], pairs.frame, near, rivals)
         hits = np.bincount(pairs.frame, hit, len(t.pose))
         looked = np.flatnonzero(count >= max(HALF * len(places), 1))
         found = hits[looked] >= HALF * count[looked]
@@ -128,43 +146,65 @@ def usual_rate(
     return float(np.clip(np.median(good), 0.3, 0.95)) if good else 0.7
 
 
-def vote(found: int, looked: int, rate: float) -> float:
-    """Log-odds that a line is there, by one drive whose frames found it so often."""
-    if not looked:
-        return 0.0
-    n = min(float(looked), FRAMES)
-    k = found / looked * n
+def aside_rate(
+    elements: Sequence[Element],
+    class_name: str,
+    drives: Sequence[Detected],
+    margin: float,
+    rivals: Any,
+) -> float:
+    """How often frames find a line where there is none but one beside it: the tails of its errors,
+    measured ``ASIDE`` metres to both sides of lines of the map."""
+    found = looks = 0
+    for e in elements[:: max(1, len(elements) // SAMPLE)]:
+        places = resample_step(e.xy, STEP)
+        for side in (ASIDE, -ASIDE):
+            for s in seen_of(places + side * normals(places), class_name, drives, margin, rivals):
+                found, looks = found + int(s.found.sum()), looks + len(s.times)
+    return float(np.clip(found / max(looks, 1), FALSE_RATE, 0.3))
 
-    def log_likelihood(q: float) -> float:
-        return k * float(np.log(q)) + (n - k) * float(np.log(1 - q))
 
-    good = np.log(1 - HARD_SHARE) + log_likelihood(rate)
-    hard = np.log(HARD_SHARE) + log_likelihood(max(HARD * rate, 1.5 * FALSE_RATE))
-    there = float(np.logaddexp(good, hard))
-    return float(np.clip(there - log_likelihood(FALSE_RATE), -SATURATED, SATURATED))
+@dataclass(frozen=True)
+class Rates:
+    """How often frames find an element of a class that is there, one that is worn, and none."""
+
+    usual: float
+    false: float = FALSE_RATE
+
+    @property
+    def hard(self) -> float:
+        """Of what is worn."""
+        return max(HARD * self.usual, 2 * self.false)
+
+    def vote(self, rate: float, found: int, looked: int) -> float:
+        """Log-likelihood ratio of one drive's frames between a rate and nothing being there."""
+        n = min(float(looked), FRAMES)
+        k = found / max(looked, 1) * n
+        odds = k * np.log(rate / self.false) + (n - k) * np.log((1 - rate) / (1 - self.false))
+        return float(np.clip(odds, -SATURATED, SATURATED))
+
+    def log_odds(self, counts: Sequence[tuple[int, int]]) -> float:
+        """Of all drives (found, looked) together that the element is there, before any prior."""
+        good = sum(self.vote(self.usual, k, n) for k, n in counts)
+        hard = sum(self.vote(self.hard, k, n) for k, n in counts)
+        return float(np.logaddexp(np.log(1 - HARD_SHARE) + good, np.log(HARD_SHARE) + hard))
 
 
-def counts_of(seen: Sequence[Seen], rate: float) -> Counts:
-    """All drives together, each with its vote; oldest first."""
+def counts_of(seen: Sequence[Seen], rates: Rates) -> tuple[Counts, float]:
+    """All drives, each with its own vote, oldest first; and what they say together."""
     looked = sorted((s for s in seen if len(s.times)), key=lambda s: (s.first_ns, s.run_id))
+    pairs = [(int(s.found.sum()), len(s.times)) for s in looked]
     drives = []
-    for s in looked:
-        odds = vote(int(s.found.sum()), len(s.times), rate)
+    for s, pair in zip(looked, pairs, strict=True):
+        odds = rates.log_odds([pair])
+        times = tuple(s.times[s.found].tolist())
         drives.append(
             DriveEvidence(
-                s.run_id,
-                s.first_ns,
-                len(s.times),
-                int(s.found.sum()),
-                tuple(s.times[s.found].tolist()),
-                s.score,
-                odds,
-                True,
-                odds > 0,
+                s.run_id, s.first_ns, pair[1], pair[0], times, s.score, odds, True, odds > 0
             )
         )
-    times = [t for d in drives for t in d.seen_ns]
-    return Counts(
+    times = tuple(t for d in drives for t in d.seen_ns)
+    counts = Counts(
         sum(d.frames_seen for d in drives),
         sum(d.frames_in_view for d in drives),
         sum(d.seen for d in drives),
@@ -174,3 +214,4 @@ def counts_of(seen: Sequence[Seen], rate: float) -> Counts:
         tuple(d.run_id for d in drives if d.seen),
         tuple(drives),
     )
+    return counts, rates.log_odds(pairs)

@@ -17,7 +17,8 @@ class Settings:
     ``threshold``: share of a class's usual confidence from which a grid cell may be a line;
     ``ridge``: how sharply (share of the confidence, per grid cell squared) it must fall to both
     sides; ``spur_m``, ``angle_deg``, ``gap_m``: branches that are dropped at junctions, ends that
-    are joined there and over gaps; ``shortest_m``: shorter lines and changes are not told;
+    are joined there and over gaps; ``shortest_m``: shorter lines and changes are not told, nor new
+    lines shorter than ``new_m``;
     ``simplify_m``: what a simplified line may be off.
     ``gate_m``, ``same_m``: lines of old and new within ``gate_m`` may be one, within ``same_m``
     they are; ``lost``: share of the usual confidence below which an old line is not there;
@@ -38,6 +39,7 @@ class Settings:
     angle_deg: float = 40.0
     gap_m: float = 5.0
     shortest_m: float = 4.0
+    new_m: float = 6.0
     simplify_m: float = 0.1
     gate_m: float = 1.5
     same_m: float = 0.8

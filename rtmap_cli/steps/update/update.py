@@ -13,6 +13,7 @@ from rtmap_cli.formats.changes import ChangeEvent
 from rtmap_cli.geometry.polylines import is_ring
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.element import RING_CLASSES, VectorMap
+from rtmap_cli.maps.evidence import Counts
 from rtmap_cli.maps.existence import probability
 from rtmap_cli.steps.update.accumulate import Heat, accumulate, layout_of
 from rtmap_cli.steps.update.cells import Cell, Judge, flagged_stretches, judge_cells
@@ -24,7 +25,14 @@ from rtmap_cli.steps.update.compare import (
     compare,
     usual_of,
 )
-from rtmap_cli.steps.update.evidence import NEAR, Detected, counts_of, seen_of, usual_rate
+from rtmap_cli.steps.update.evidence import (
+    Detected,
+    Rates,
+    aside_rate,
+    counts_of,
+    seen_of,
+    usual_rate,
+)
 from rtmap_cli.steps.update.outlines import Line
 from rtmap_cli.steps.update.settings import Settings
 from rtmap_cli.steps.update.vectorise import usual_confidence, vectorise
@@ -32,6 +40,8 @@ from rtmap_cli.steps.update.vectorise import usual_confidence, vectorise
 Array = NDArray[np.float64]
 
 KINDS = {MISSING_OLD: "insert", MISSING_NEW: "delete", MOVED: "modify"}
+BESIDE = 2.5
+"""What is new so near (m) to a line of its class may be that line's errors."""
 BEFORE = {"insert": -1.0, "delete": -2.5, "modify": -1.0}
 """Log-odds of a change before the votes: most of a map is right."""
 
@@ -94,27 +104,45 @@ def _judged(
     settings: Settings,
 ) -> list[tuple[Stretch, ChangeEvent]]:
     """The stretches whose drives' votes make them probable enough, as changes."""
+    import shapely
+
     out = []
     for name in dict.fromkeys(s.class_name for s in stretches):
         drives = [Detected.of(t, name) for t in traversals]
-        gone = {s.element_id for s in stretches}
+        mine = [s for s in stretches if s.class_name == name]
+        gone = {s.element_id for s in mine}
         there = [e for e in old.of_class(name) if e.element_id not in gone]
-        rate = usual_rate(there, name, drives, settings.margin_m)
-        for s in (s for s in stretches if s.class_name == name):
-            event = _event(s, drives, rate, settings)
-            if event.probability >= settings.min_probability:
+        alone = Rates(usual_rate(there, name, drives, settings.margin_m))
+        beside, kept = alone, None
+        if name not in RING_CLASSES and there:
+            kept = shapely.union_all([shapely.LineString(e.xy) for e in there])
+            false = aside_rate(there, name, drives, settings.margin_m, kept)
+            beside = Rates(max(alone.usual, 1.5 * false), false)
+        for s in mine:
+            near = kept is not None and s.reason != MISSING_NEW
+            near = near and shapely.distance(shapely.LineString(s.points), kept) < BESIDE
+            rivals = kept
+            if len(s.before) > 1 and name not in RING_CLASSES:
+                # What is nearer to where it lay does not say that it moved.
+                was = shapely.LineString(s.before)
+                rivals = was if kept is None else shapely.union(was, kept)
+            counts, votes = counts_of(
+                seen_of(s.points, name, drives, settings.margin_m, rivals),
+                beside if near else alone,
+            )
+            event = _event(s, counts, votes)
+            agreed = counts.traversals_seen
+            if event.kind == "delete":
+                agreed = counts.traversals_in_view - agreed
+            enough = agreed >= min(settings.drives, len(drives))
+            if enough and event.probability >= settings.min_probability:
                 out.append((s, event))
     return out
 
 
-def _event(
-    stretch: Stretch, drives: Sequence[Detected], rate: float, settings: Settings
-) -> ChangeEvent:
+def _event(stretch: Stretch, counts: Counts, votes: float) -> ChangeEvent:
+    """A stretch as a change, with what its drives say."""
     kind = KINDS[stretch.reason]
-    counts = counts_of(
-        seen_of(stretch.points, stretch.class_name, drives, settings.margin_m, NEAR), rate
-    )
-    votes = sum(d.log_odds for d in counts.drives)
     odds = BEFORE[kind] + (-votes if kind == "delete" else votes)
     points = stretch.points
     if stretch.class_name in RING_CLASSES and not is_ring(points):
