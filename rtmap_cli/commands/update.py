@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,10 @@ import click
 from rtmap_cli import options
 
 if TYPE_CHECKING:
-    from rtmap_cli.maps.element import VectorMap
+    from rtmap_cli.logs.traversal import Traversal
+    from rtmap_cli.maps.element import Element, VectorMap
+    from rtmap_cli.maps.evidence import Policy
+    from rtmap_cli.steps.crowdsource.fuse import Fusion
     from rtmap_cli.steps.update.cells import Detection
     from rtmap_cli.steps.update.settings import Settings
     from rtmap_cli.steps.update.update import Update
@@ -133,6 +136,24 @@ def precision(pred: Sequence[Detection], true: Sequence[Detection]) -> dict[str,
     scorer = Scorer(sorted({e[0] for e in true}))
     scorer.add(pred, true)
     return {name: score.mean for name, score in scorer.result().classes.items()}
+
+
+def fuse_region_grid(
+    traversals: Sequence[Traversal],
+    prior: VectorMap,
+    classes: Sequence[str],
+    fused: Collection[str],
+    policy: Policy | None = None,
+) -> tuple[Fusion, list[Element]]:
+    """One region fused by accumulation grids: `crowdsource --method grid`. Runs that were ``fused``
+    before are witnesses like others; of a policy it takes how many drives must agree."""
+    from rtmap_cli.steps.crowdsource.fuse import Fusion
+    from rtmap_cli.steps.update.fusion import fuse_grid
+    from rtmap_cli.steps.update.settings import Settings
+
+    settings = Settings(drives=policy.insert_traversals) if policy else Settings()
+    g = fuse_grid(traversals, prior, classes, precision, settings)
+    return Fusion(g.vector_map, g.inserted, g.deleted, g.split, g.moved, g.untouched), []
 
 
 def _classes(
