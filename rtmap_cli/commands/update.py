@@ -143,16 +143,18 @@ def fuse_region_grid(
     prior: VectorMap,
     classes: Sequence[str],
     fused: Collection[str],
+    common: float = 0.0,
     policy: Policy | None = None,
 ) -> tuple[Fusion, list[Element]]:
     """One region fused by accumulation grids: `crowdsource --method grid`. Runs that were ``fused``
-    before are witnesses like others; of a policy it takes how many drives must agree."""
+    before are witnesses like others; ``common`` is the variance (m²) of the place that all of them
+    share; of a policy it takes how many drives must agree."""
     from rtmap_cli.steps.crowdsource.fuse import Fusion
     from rtmap_cli.steps.update.fusion import fuse_grid
     from rtmap_cli.steps.update.settings import Settings
 
     settings = Settings(drives=policy.insert_traversals) if policy else Settings()
-    g = fuse_grid(traversals, prior, classes, precision, settings)
+    g = fuse_grid(traversals, prior, classes, precision, settings, common)
     return Fusion(g.vector_map, g.inserted, g.deleted, g.split, g.moved, g.untouched), []
 
 

@@ -51,11 +51,13 @@ def fuse_grid(
     classes: Sequence[str],
     judge: Judge,
     settings: Settings,
+    common: float = 0.0,
 ) -> GridFusion:
-    """The map that the grids of some drives make of a prior, which may be empty."""
+    """The map that the grids of some drives make of a prior, which may be empty; ``common``:
+    variance (m²) of the place that all of them share."""
     traversals = sorted(traversals, key=lambda t: t.run_id)
     if not len(prior):
-        elements = first_map(traversals, classes, settings)
+        elements = first_map(traversals, classes, settings, common)
         names = [e.element_id for e in elements]
         return GridFusion(VectorMap(elements, prior.crs), names, [], [], [], [])
     told = update(traversals, prior, classes, judge, settings)
@@ -96,7 +98,10 @@ def edit_of(event: ChangeEvent) -> Edit:
 
 
 def first_map(
-    traversals: Sequence[Traversal], classes: Sequence[str], settings: Settings
+    traversals: Sequence[Traversal],
+    classes: Sequence[str],
+    settings: Settings,
+    common: float = 0.0,
 ) -> list[Element]:
     """The lines of the grids as elements, where enough drives stand behind them."""
     heat = accumulate(traversals, classes, layout_of(traversals, settings), settings)
@@ -109,7 +114,7 @@ def first_map(
         for line in lines:
             if line.drives < BEHIND * needed(heat, settings):
                 continue
-            out.append(_element(line, heat, drives, settings, taken, model))
+            out.append(_element(line, heat, drives, settings, taken, model, common))
     return out
 
 
@@ -120,6 +125,7 @@ def _element(
     settings: Settings,
     taken: set[str],
     model: str | None,
+    common: float,
 ) -> Element:
     """A line with its evidence and the variance of its place."""
     seen = seen_of(line.points, line.class_name, drives, settings.margin_m)
@@ -134,7 +140,7 @@ def _element(
         name,
         line.class_name,
         line.points,
-        _covariance(line, heat, settings),
+        _covariance(line, heat, settings, common),
         votes,
         counts.frames_seen,
         counts.frames_in_view,
@@ -147,7 +153,7 @@ def _element(
     )
 
 
-def _covariance(line: Line, heat: Heat, settings: Settings) -> Array:
+def _covariance(line: Line, heat: Heat, settings: Settings, common: float) -> Array:
     """(n, 4) xx, xy, yy, zz per vertex (m²), the same along and across.
 
     The profile of the grid across a line is that of its detections and of the blur: f / f″ = −σ² at
@@ -165,6 +171,6 @@ def _covariance(line: Line, heat: Heat, settings: Settings) -> Array:
         width = np.full(len(line.points), step**2)
     variance = np.clip(width / max(line.drives, 1.0), REPEATABLE**2, WIDEST**2)
     out = np.full((len(line.points), 4), np.nan)
-    out[:, 0] = out[:, 2] = variance
+    out[:, 0] = out[:, 2] = variance + common
     out[:, 1] = 0.0
     return out
