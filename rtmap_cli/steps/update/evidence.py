@@ -33,6 +33,8 @@ RING_NEAR = 3.0
 """... of the centre of an outline."""
 HALF = 0.5
 """Share of a stretch that must be in view, and of what is in view that must be found."""
+ENOUGH = 8
+"""So many places of a stretch are enough of a long one."""
 FRAMES = 12.0
 """Frames of one drive count as so many at most: they are alike."""
 FALSE_RATE = 0.02
@@ -122,7 +124,7 @@ def seen_of(
         near = RING_NEAR if ring else NEAR
         hit, row = d.found(places[pairs.point], pairs.frame, near, rivals)
         hits = np.bincount(pairs.frame, hit, len(t.pose))
-        looked = np.flatnonzero(count >= max(HALF * len(places), 1))
+        looked = np.flatnonzero(count >= max(min(HALF * len(places), ENOUGH), 1))
         found = hits[looked] >= HALF * count[looked]
         used = hit & np.isin(pairs.frame, looked[found])
         score = float(t.score[row[used]].mean()) if used.any() else None
