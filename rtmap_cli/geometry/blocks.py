@@ -20,6 +20,8 @@ Bool = NDArray[np.bool_]
 
 SIDE = 64
 """Cells of a block's side."""
+_BITS = 6
+_LOW = SIDE - 1
 _HALF = 1 << 30
 _SHIFT = 31
 AROUND = np.array([[-1, 1], [0, 1], [1, 1], [1, 0], [1, -1], [0, -1], [-1, -1], [-1, 0]])
@@ -73,8 +75,8 @@ class Layout:
 
     def places(self, cells: Int) -> Int:
         """(n,) flat places in a raster of integer cells (n, 2), −1 where no block is."""
-        block = find(self.keys, pack(cells // SIDE))
-        flat = block * SIDE * SIDE + (cells[:, 1] % SIDE) * SIDE + cells[:, 0] % SIDE
+        block = find(self.keys, pack(cells >> _BITS))
+        flat = (((block << _BITS) | (cells[:, 1] & _LOW)) << _BITS) | (cells[:, 0] & _LOW)
         return np.where(block >= 0, flat, -1)
 
     def cells(self, flat: Int) -> Int:
@@ -93,9 +95,9 @@ class Layout:
     def deposit(self, xy: Array, weight: Array) -> Float:
         """A raster with each weight (n,) spread over the four cells around its point (n, 2), by
         bilinear shares: their mean place is the point. What has no block is dropped."""
-        out = np.zeros(len(self) * SIDE * SIDE)
-        for place, share in self._corners(xy):
-            out += np.bincount(place + 1, share * weight, len(out) + 1)[1:]
+        place, share = (np.concatenate(part) for part in zip(*self._corners(xy), strict=True))
+        size = len(self) * SIDE * SIDE
+        out = np.bincount(place + 1, share * np.tile(weight, 4), size + 1)[1:]
         return out.reshape(-1, SIDE, SIDE).astype(np.float32)
 
     def count(self, cells: Int, weight: Array) -> Float:
@@ -145,11 +147,17 @@ class Layout:
         at = xy / self.cell - 0.5
         low = np.floor(at).astype(np.int64)
         part = at - low
+        left, below = 1.0 - part[:, 0], 1.0 - part[:, 1]
+        flat = self.places(low)
+        # Nearly all have their four cells in one block.
+        last = low & _LOW == _LOW
+        edge = np.flatnonzero(last[:, 0] | last[:, 1] | (flat < 0))
         for dx in (0, 1):
             for dy in (0, 1):
-                corner: Int = low + np.array([dx, dy])
-                share = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
-                yield self.places(corner), share
+                place = flat + (dx + dy * SIDE)
+                place[edge] = self.places(low[edge] + np.array([dx, dy]))
+                x, y = (part[:, 0] if dx else left), (part[:, 1] if dy else below)
+                yield place, x * y
 
     def add(self, total: Float, part: Float, layout: Layout) -> None:
         """Add a raster of another ``layout``, whose blocks are all here, to ``total``."""
