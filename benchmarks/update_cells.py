@@ -102,7 +102,8 @@ def scored(vector_map: VectorMap, world: VectorMap, lows: Sequence[Sequence[floa
     half = (-CELL / 2, -CELL / 2, CELL / 2, CELL / 2)
     out = []
     for x, y in lows:
-        pose = se3_from_xyyaw(x + CELL / 2, y + CELL / 2, 0.0)
+        centre = np.array([[x + CELL / 2, y + CELL / 2]])
+        pose = se3_from_xyyaw(centre[:, 0], centre[:, 1], np.zeros(1))[0]
         sides = [
             [(e.class_name, e.points, 1.0) for e in side.crop(pose, half)] for side in (index, true)
         ]
@@ -129,9 +130,8 @@ def unchanged(before: VectorMap, after: VectorMap, named: set[str]) -> bool:
         other = new.get(e.element_id)
         if other is None or e.points.tobytes() != other.points.tobytes():
             return False
-        if (e.covariance is None) != (other.covariance is None):
-            return False
-        if e.covariance is not None and e.covariance.tobytes() != other.covariance.tobytes():
+        sides = [None if x.covariance is None else x.covariance.tobytes() for x in (e, other)]
+        if sides[0] != sides[1]:
             return False
     return True
 

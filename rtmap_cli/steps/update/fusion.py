@@ -16,7 +16,7 @@ from rtmap_cli.maps.edits import Edit, apply_edits
 from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
 from rtmap_cli.steps.update.accumulate import Heat, accumulate, layout_of
 from rtmap_cli.steps.update.cells import Judge
-from rtmap_cli.steps.update.compare import BEHIND, needed
+from rtmap_cli.steps.update.compare import BEHIND, looked_at, needed
 from rtmap_cli.steps.update.evidence import Detected, Rates, counts_of, seen_of
 from rtmap_cli.steps.update.outlines import Line
 from rtmap_cli.steps.update.settings import Settings
@@ -112,7 +112,9 @@ def first_map(
         lines = vectorise(heat, name, usual_confidence(heat, name), settings)
         drives = [Detected.of(t, name) for t in traversals]
         for line in lines:
-            if line.drives < BEHIND * needed(heat, settings):
+            # Where only one drive looked, it is enough: there is nothing else to map it from.
+            looked = float(np.median(looked_at(heat, line.points)))
+            if line.drives < BEHIND * min(needed(heat, settings), max(looked, 1.0)):
                 continue
             out.append(_element(line, heat, drives, settings, taken, model, common))
     return out
