@@ -16,6 +16,7 @@ COMMANDS: dict[str, Any] = {
     "infer": ("infer", "Read a log with the network: observations of every frame."),
     "localize": ("localize", "Find where each frame stands on the prior map."),
     "detect-changes": ("detect_changes", "Tell what is gone and what is new."),
+    "update": ("update", "Flag the cells of a map that predictions contradict."),
     "crowdsource": ("crowdsource", "Fuse runs into the next version of the map."),
     "evaluate": (
         "Compare with ground truth.",
@@ -59,6 +60,9 @@ COMMANDS: dict[str, Any] = {
             "ls": ("map_ls", "List the elements of a map."),
             "log": ("map_log", "List the versions of a map."),
             "diff": ("map_diff", "What changed between two versions."),
+            "review": ("map_review", "Decide on the changes of a file."),
+            "apply": ("map_apply", "Make the accepted changes of a file."),
+            "revert": ("map_revert", "Undo one version."),
             "restore": ("map_restore", "Make an old version the newest one."),
             "validate": ("map_validate", "Check a map folder."),
             "gc": ("map_gc", "Remove files that no kept version needs."),

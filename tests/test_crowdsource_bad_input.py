@@ -248,9 +248,7 @@ def test_an_area_that_the_prior_does_not_cover_is_mapped(rtmap: Call, tmp_path: 
     assert far > 110
 
 
-@pytest.mark.parametrize(
-    "wrong", [["--method", "grid"], ["--engine", "dask"], ["--scheduler", "tcp://a:1"]]
-)
+@pytest.mark.parametrize("wrong", [["--engine", "dask"], ["--scheduler", "tcp://a:1"]])
 def test_options_that_cannot_be_meant(rtmap: Call, tmp_path: Path, wrong: list[str]) -> None:
     save(drive(street(), "d0", span=(0.0, 10.0)), tmp_path / "runs/d0")
     told = rtmap("crowdsource", tmp_path / "runs", "--map", tmp_path / "map", *wrong, code=2).err

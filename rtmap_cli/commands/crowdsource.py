@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     type=click.Choice(["elements", "grid"]),
     default="elements",
     show_default=True,
-    help="How to fuse; grid (accumulation maps) is reserved and not there yet.",
+    help="How to fuse: element by element, or accumulation grids (`rtmap update`).",
 )
 @click.option("--scheduler", metavar="ADDRESS", help="Of the cluster: tcp://HOST:PORT.")
 @options.as_json
@@ -85,7 +85,8 @@ def command(
     Example:
       rtmap crowdsource runs --map map --message "week 12"
     """
-    from rtmap_cli.errors import NoAnswer, UsageError
+    from rtmap_cli.commands.update import fuse_region_grid
+    from rtmap_cli.errors import NoAnswer
     from rtmap_cli.logs.agreement import warning_of
     from rtmap_cli.logs.tracks import read_tracks
     from rtmap_cli.logs.traversal import find_runs
@@ -94,8 +95,6 @@ def command(
     from rtmap_cli.output import emit, log
     from rtmap_cli.steps.crowdsource.crowdsource import Task, crowdsource
 
-    if method == "grid":
-        raise UsageError("--method grid is reserved: maps are fused from elements so far")
     workers = _workers(jobs, engine, scheduler)
     exists = map_exists(map_path)
     before = read_map(map_path) if exists else None
@@ -109,7 +108,8 @@ def command(
     fresh = [t for t in tracks if t.run_id not in done]
     _tell_unlocalized([t.run_id for t in fresh if not t.localized], exists)
     _tell_mixed(fresh, before.version if before else None)
-    compose = partial(fuse_region, policy=read_policy(policy_path) if policy_path else None)
+    by_method = fuse_region_grid if method == "grid" else fuse_region
+    compose = partial(by_method, policy=read_policy(policy_path) if policy_path else None)
     fusion, astray = None, {}
     if fresh:
         found = crowdsource(task, tracks, compose, workers, skip_bad_runs)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,21 +78,36 @@ def _drive_properties(drive: DriveEvidence) -> dict[str, Any]:
 
 
 def write_changes(
-    changes: Sequence[ChangeEvent], crs: str, path: str | Path, info: dict[str, Any] | None = None
+    changes: Sequence[ChangeEvent],
+    crs: str,
+    path: str | Path,
+    info: dict[str, Any] | None = None,
+    reasons: Mapping[str, str] | None = None,
 ) -> None:
-    """Write changes as GeoJSON in WGS84, whole or not at all (``-``: stdout)."""
+    """Write changes as GeoJSON in WGS84, whole or not at all (``-``: stdout).
+
+    ``reasons`` by change id become the property ``reason``.
+    """
     members = {
         "rtmap": {"schema": CHANGES_SCHEMA, "schema_version": CHANGES_VERSION} | (info or {})
     }
-    write_features([_feature(c, crs) for c in changes], path, members)
+    # In every feature too: editors drop the members of a collection.
+    version = (info or {}).get("map_version")
+    own = {} if version is None else {"map_version": version}
+    why = reasons or {}
+    features = [
+        _feature(c, crs, own | ({"reason": why[c.change_id]} if c.change_id in why else {}))
+        for c in changes
+    ]
+    write_features(features, path, members)
 
 
-def _feature(change: ChangeEvent, crs: str) -> dict[str, Any]:
+def _feature(change: ChangeEvent, crs: str, own: dict[str, Any]) -> dict[str, Any]:
     closed = change.class_name in RING_CLASSES and len(change.points) > 3
     points = change.points
     if closed and not counter_clockwise(points):
         points = points[::-1]
-    return feature(points, crs, closed, change.properties())
+    return feature(points, crs, closed, change.properties() | own)
 
 
 def write_change_table(changes: Sequence[ChangeEvent], path: str | Path, crs: str) -> None:

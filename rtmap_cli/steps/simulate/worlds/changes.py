@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rtmap_cli.errors import NoAnswer, UsageError
-from rtmap_cli.geometry.polylines import arc_length, is_ring, normals, tangents
+from rtmap_cli.geometry.polylines import arc_length, is_ring, normals, resample, tangents
 from rtmap_cli.maps.crs import to_lonlat
 from rtmap_cli.maps.element import CLASSES, RING_CLASSES, Element, VectorMap
 from rtmap_cli.steps.simulate.worlds.world import even_odd_surface
@@ -322,7 +322,8 @@ class _Work:
             points = gone.points + side * normals(gone.points)
             inside = shapely.contains(self.surface, shapely.linestrings(points).buffer(0.3))
             others = [shapely.linestrings(e.xy) for e in self.elements.values()]
-            clear = shapely.distance(shapely.linestrings(points[1:-1]), others).min() > 0.6
+            inner = points[1:-1] if len(points) > 3 else resample(points, 5)[1:-1]
+            clear = shapely.distance(shapely.linestrings(inner), others).min() > 0.6
             if inside and clear:
                 source = saved[0][gone.element_id]
                 self._add(class_name, points, dict(source.attributes), moved)

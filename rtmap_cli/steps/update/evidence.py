@@ -1,0 +1,219 @@
+"""What each drive says about a stretch: frames that had it in view, frames that found it, a vote.
+
+A drive's vote is the log-likelihood ratio of its frames under "the line is there" and "it is not"
+(found now and then); frames of one drive are alike, so that they count as a few and the vote
+saturates. What is there is found at the usual rate of its class or, where it is worn or half
+hidden, at a part of it; it is worn for all drives or for none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.blocks import points_along
+from rtmap_cli.geometry.polylines import normals, resample_step
+from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.element import RING_CLASSES, Element
+from rtmap_cli.maps.evidence import Counts, DriveEvidence
+from rtmap_cli.maps.visibility import views
+
+Array = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+STEP = 2.0
+"""Metres between the places of a stretch that are looked at."""
+NEAR = 1.0
+"""A detection within so much (m) of a line found it."""
+RING_NEAR = 3.0
+"""... of the centre of an outline."""
+HALF = 0.5
+"""Share of a stretch that must be in view, and of what is in view that must be found."""
+ENOUGH = 8
+"""So many places of a stretch are enough of a long one."""
+FRAMES = 12.0
+"""Frames of one drive count as so many at most: they are alike."""
+FALSE_RATE = 0.02
+"""How often frames find what is not there."""
+HARD, HARD_SHARE = 0.25, 0.15
+"""Part of the usual rate at which worn places are found, and how many places are."""
+SATURATED = 4.0
+"""No drive says more (log-odds)."""
+ASIDE = 1.5
+"""Metres beside a line at which its errors look like a line of their own."""
+SAMPLE = 60
+"""Stretches of old elements whose rate of being found is the usual one."""
+
+
+@dataclass(frozen=True)
+class Detected:
+    """The detections of one drive and class for look-ups: a KD-tree over x, y and frame."""
+
+    traversal: Traversal
+    tree: Any
+    xy: Array
+    row: Int
+
+    @staticmethod
+    def of(traversal: Traversal, class_name: str) -> Detected:
+        """Points along the lines of a class, or the middles of its outlines."""
+        from scipy.spatial import cKDTree
+
+        mine = np.flatnonzero(traversal.class_name == class_name)
+        if class_name in RING_CLASSES:
+            which, xy = np.arange(len(mine)), traversal.points[mine][:, :-1].mean(axis=1)
+        else:
+            which, xy, _ = points_along(traversal.points[mine], NEAR)
+        xy, frame = xy.reshape(-1, 2), traversal.frame[mine[which]]
+        return Detected(traversal, cKDTree(_lifted(xy, frame)), xy, mine[which])
+
+    def found(
+        self, xy: Array, frame: Int, near: float, rivals: Any = None
+    ) -> tuple[NDArray[np.bool_], Int]:
+        """Whether some detection of its frame lies within ``near`` metres of each point (n, 2), and
+        its row; one that lies nearer to a line of ``rivals`` (shapely) is that line's."""
+        if not len(self.row):
+            return np.zeros(len(xy), bool), np.zeros(len(xy), np.int64)
+        far, at = self.tree.query(_lifted(xy, frame), distance_upper_bound=near)
+        hit, at = np.isfinite(far), np.minimum(at, len(self.row) - 1)
+        if rivals is not None and hit.any():
+            import shapely
+
+            other = shapely.distance(shapely.points(self.xy[at[hit]]), rivals)
+            hit[hit] = far[hit] <= other
+        return hit, self.row[at]
+
+
+def _lifted(xy: Array, frame: Int) -> Array:
+    """Points with their frame as a third axis: those of other frames are far away."""
+    return np.column_stack([xy, frame * 1000.0])
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Frames of one drive that had a stretch in view (``times``, ns), which of them ``found`` it,
+    and the mean score of what they found (None: nothing)."""
+
+    run_id: str
+    times: Int
+    found: NDArray[np.bool_]
+    score: float | None
+    first_ns: int
+
+
+def seen_of(
+    points: Array,
+    class_name: str,
+    drives: Sequence[Detected],
+    margin: float,
+    rivals: Any = None,
+) -> list[Seen]:
+    """What each drive saw of a stretch (n, 2) in the map frame; ``rivals``: other lines (shapely)
+    that detections may belong to."""
+    ring = class_name in RING_CLASSES
+    places = points[:-1].mean(axis=0)[None] if ring else resample_step(points, STEP)
+    out = []
+    for d in drives:
+        t = d.traversal
+        pairs = views(places, t.pose, t.range_m, t.occluders, margin)
+        count = np.bincount(pairs.frame, minlength=len(t.pose))
+        near = RING_NEAR if ring else NEAR
+        hit, row = d.found(places[pairs.point], pairs.frame, near, rivals)
+        hits = np.bincount(pairs.frame, hit, len(t.pose))
+        looked = np.flatnonzero(count >= max(min(HALF * len(places), ENOUGH), 1))
+        found = hits[looked] >= HALF * count[looked]
+        used = hit & np.isin(pairs.frame, looked[found])
+        score = float(t.score[row[used]].mean()) if used.any() else None
+        times = t.timestamp_ns[looked]
+        out.append(Seen(t.run_id, times, found, score, int(t.timestamp_ns[0])))
+    return out
+
+
+def usual_rate(
+    elements: Sequence[Element], class_name: str, drives: Sequence[Detected], margin: float
+) -> float:
+    """How often frames find an element of a class that is there: the upper half of what is
+    measured on elements of the map, so that those which are gone do not count."""
+    rates = []
+    for e in elements[:: max(1, len(elements) // SAMPLE)]:
+        seen = seen_of(e.xy, class_name, drives, margin)
+        looks = sum(len(s.times) for s in seen)
+        if looks >= 4:
+            rates.append(sum(int(s.found.sum()) for s in seen) / looks)
+    good = [r for r in rates if r > 2 * FALSE_RATE]
+    return float(np.clip(np.median(good), 0.3, 0.95)) if good else 0.7
+
+
+def aside_rate(
+    elements: Sequence[Element],
+    class_name: str,
+    drives: Sequence[Detected],
+    margin: float,
+    rivals: Any,
+) -> float:
+    """How often frames find a line where there is none but one beside it: the tails of its errors,
+    measured ``ASIDE`` metres to both sides of lines of the map."""
+    found = looks = 0
+    for e in elements[:: max(1, len(elements) // SAMPLE)]:
+        places = resample_step(e.xy, STEP)
+        for side in (ASIDE, -ASIDE):
+            for s in seen_of(places + side * normals(places), class_name, drives, margin, rivals):
+                found, looks = found + int(s.found.sum()), looks + len(s.times)
+    return float(np.clip(found / max(looks, 1), FALSE_RATE, 0.3))
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How often frames find an element of a class that is there, one that is worn, and none."""
+
+    usual: float
+    false: float = FALSE_RATE
+
+    @property
+    def hard(self) -> float:
+        """Of what is worn."""
+        return max(HARD * self.usual, 2 * self.false)
+
+    def vote(self, rate: float, found: int, looked: int) -> float:
+        """Log-likelihood ratio of one drive's frames between a rate and nothing being there."""
+        n = min(float(looked), FRAMES)
+        k = found / max(looked, 1) * n
+        odds = k * np.log(rate / self.false) + (n - k) * np.log((1 - rate) / (1 - self.false))
+        return float(np.clip(odds, -SATURATED, SATURATED))
+
+    def log_odds(self, counts: Sequence[tuple[int, int]]) -> float:
+        """Of all drives (found, looked) together that the element is there, before any prior."""
+        good = sum(self.vote(self.usual, k, n) for k, n in counts)
+        hard = sum(self.vote(self.hard, k, n) for k, n in counts)
+        return float(np.logaddexp(np.log(1 - HARD_SHARE) + good, np.log(HARD_SHARE) + hard))
+
+
+def counts_of(seen: Sequence[Seen], rates: Rates) -> tuple[Counts, float]:
+    """All drives, each with its own vote, oldest first; and what they say together."""
+    looked = sorted((s for s in seen if len(s.times)), key=lambda s: (s.first_ns, s.run_id))
+    pairs = [(int(s.found.sum()), len(s.times)) for s in looked]
+    drives = []
+    for s, pair in zip(looked, pairs, strict=True):
+        odds = rates.log_odds([pair])
+        times = tuple(s.times[s.found].tolist())
+        drives.append(
+            DriveEvidence(
+                s.run_id, s.first_ns, pair[1], pair[0], times, s.score, odds, True, odds > 0
+            )
+        )
+    times = tuple(t for d in drives for t in d.seen_ns)
+    counts = Counts(
+        sum(d.frames_seen for d in drives),
+        sum(d.frames_in_view for d in drives),
+        sum(d.seen for d in drives),
+        len(drives),
+        min(times) if times else None,
+        max(times) if times else None,
+        tuple(d.run_id for d in drives if d.seen),
+        tuple(drives),
+    )
+    return counts, rates.log_odds(pairs)

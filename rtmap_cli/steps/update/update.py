@@ -1,0 +1,166 @@
+"""Alg. 1 as a whole: accumulate, vectorise, compare with the map by cells, tell the changes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.formats.changes import ChangeEvent
+from rtmap_cli.geometry.polylines import is_ring
+from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.element import RING_CLASSES, VectorMap
+from rtmap_cli.maps.evidence import Counts
+from rtmap_cli.maps.existence import probability
+from rtmap_cli.steps.update.accumulate import Heat, accumulate, layout_of
+from rtmap_cli.steps.update.cells import Cell, Judge, flagged_stretches, judge_cells
+from rtmap_cli.steps.update.compare import (
+    MISSING_NEW,
+    MISSING_OLD,
+    MOVED,
+    Stretch,
+    compare,
+    usual_of,
+)
+from rtmap_cli.steps.update.evidence import (
+    Detected,
+    Rates,
+    aside_rate,
+    counts_of,
+    seen_of,
+    usual_rate,
+)
+from rtmap_cli.steps.update.outlines import Line
+from rtmap_cli.steps.update.settings import Settings
+from rtmap_cli.steps.update.vectorise import usual_confidence, vectorise
+
+Array = NDArray[np.float64]
+
+KINDS = {MISSING_OLD: "insert", MISSING_NEW: "delete", MOVED: "modify"}
+BESIDE = 2.5
+"""What is new so near (m) to a line of its class may be that line's errors."""
+BEFORE = {"insert": -1.0, "delete": -2.5, "modify": -1.0}
+"""Log-odds of a change before the votes: most of a map is right."""
+
+
+@dataclass(frozen=True)
+class Update:
+    """The grids, the lines found in them, the cells, and the changes with their reasons."""
+
+    heat: Heat
+    lines: list[Line]
+    cells: list[Cell]
+    events: list[ChangeEvent]
+    reasons: dict[str, str]
+
+
+def update(
+    traversals: Sequence[Traversal],
+    old: VectorMap,
+    classes: Sequence[str],
+    judge: Judge,
+    settings: Settings,
+) -> Update:
+    """What some drives say of a map: cells that differ, and the changes that put them right."""
+    heat = accumulate(traversals, classes, layout_of(traversals, settings), settings)
+    near = _in_reach(old, heat)
+    lines: list[Line] = []
+    stretches: list[Stretch] = []
+    for name in classes:
+        mine = near.of_class(name)
+        usual = usual_of(mine, heat, usual_confidence(heat, name))
+        found = vectorise(heat, name, usual, settings)
+        lines += found
+        stretches += compare(mine, found, heat, usual, settings)
+    told = _judged(stretches, traversals, near, settings)
+    kept = [s for s, _ in told]
+    cells = judge_cells(list(near), lines, kept, heat, judge, settings)
+    flagged = {id(s) for s in flagged_stretches(kept, cells)}
+    events = [(e, s.reason) for s, e in told if id(s) in flagged]
+    events.sort(key=lambda x: (-x[0].probability, x[0].change_id))
+    reasons = {e.change_id: reason for e, reason in events}
+    return Update(heat, lines, cells, [e for e, _ in events], reasons)
+
+
+def _in_reach(old: VectorMap, heat: Heat) -> VectorMap:
+    """The elements of which some vertex lies in a block of the grids."""
+    points = [e.xy for e in old]
+    if not points:
+        return old
+    cells = np.floor(np.concatenate(points) / heat.layout.cell).astype(np.int64)
+    there = heat.layout.places(cells) >= 0
+    owner = np.repeat(np.arange(len(points)), [len(p) for p in points])
+    kept = np.bincount(owner, there, len(points)) > 0
+    return VectorMap([e for e, k in zip(old, kept, strict=True) if k], old.crs, old.version)
+
+
+def _judged(
+    stretches: Sequence[Stretch],
+    traversals: Sequence[Traversal],
+    old: VectorMap,
+    settings: Settings,
+) -> list[tuple[Stretch, ChangeEvent]]:
+    """The stretches whose drives' votes make them probable enough, as changes."""
+    import shapely
+
+    out = []
+    for name in dict.fromkeys(s.class_name for s in stretches):
+        drives = [Detected.of(t, name) for t in traversals]
+        mine = [s for s in stretches if s.class_name == name]
+        gone = {s.element_id for s in mine}
+        there = [e for e in old.of_class(name) if e.element_id not in gone]
+        alone = Rates(usual_rate(there, name, drives, settings.margin_m))
+        beside, kept = alone, None
+        if name not in RING_CLASSES and there:
+            kept = shapely.union_all([shapely.LineString(e.xy) for e in there])
+            false = aside_rate(there, name, drives, settings.margin_m, kept)
+            beside = Rates(max(alone.usual, 1.5 * false), false)
+        for s in mine:
+            near = kept is not None and s.reason != MISSING_NEW
+            near = near and shapely.distance(shapely.LineString(s.points), kept) < BESIDE
+            rivals = kept
+            if len(s.before) > 1 and name not in RING_CLASSES:
+                # What is nearer to where it lay does not say that it moved.
+                was = shapely.LineString(s.before)
+                rivals = was if kept is None else shapely.union(was, kept)
+            counts, votes = counts_of(
+                seen_of(s.points, name, drives, settings.margin_m, rivals),
+                beside if near else alone,
+            )
+            event = _event(s, counts, votes)
+            agreed = counts.traversals_seen
+            if event.kind == "delete":
+                agreed = counts.traversals_in_view - agreed
+            enough = agreed >= min(settings.drives, len(drives))
+            if enough and event.probability >= settings.min_probability:
+                out.append((s, event))
+    return out
+
+
+def _event(stretch: Stretch, counts: Counts, votes: float) -> ChangeEvent:
+    """A stretch as a change, with what its drives say."""
+    kind = KINDS[stretch.reason]
+    odds = BEFORE[kind] + (-votes if kind == "delete" else votes)
+    points = stretch.points
+    if stretch.class_name in RING_CLASSES and not is_ring(points):
+        points = np.concatenate([points, points[:1]])
+    return ChangeEvent(
+        _change_id(kind, stretch.element_id, stretch.class_name, points),
+        kind,
+        stretch.class_name,
+        stretch.element_id,
+        points,
+        float(probability(odds)),
+        float(odds),
+        counts,
+    )
+
+
+def _change_id(kind: str, element_id: str | None, class_name: str, points: Array) -> str:
+    """The same change of the same place gets the same id every time."""
+    x, y = np.round(points.mean(axis=0)).astype(int)
+    text = f"{kind} {element_id or class_name} {x} {y}"
+    return f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:10]}"
