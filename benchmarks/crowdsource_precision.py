@@ -91,7 +91,12 @@ def main(arguments: list[str] | None = None) -> int:
             kept[f"{kind}, {title}"] = {"mean_m": mean, "inside_90": inside, "n": len(error)}
             p90 = float(np.percentile(error, 90))
             rows.append(
-                [f"{kind}, {title}", len(error), f"{mean:.3f} / {p90:.3f}", f"{100 * inside:.1f}"]
+                [
+                    f"{kind}, {title}",
+                    str(len(error)),
+                    f"{mean:.3f} / {p90:.3f}",
+                    f"{100 * inside:.1f}",
+                ]
             )
             judged.append(Verdict(f"{kind}, {title}: mean error (m)", mean, -np.inf, BAR))
             judged.append(Verdict(f"{kind}, {title}: in the 90 % interval", inside, *INSIDE_90))
