@@ -87,14 +87,6 @@ def assign_once(
     return Feet(*(np.concatenate([getattr(p, n) for p in parts]) for n in names)), taken
 
 
-def sides(samples: Samples) -> Int:
-    """(n,) 2 · detection, + 1 where it runs against its own beginning: around the tip of an
-    island one detection sees both sides, which are two lines."""
-    start = np.searchsorted(samples.detection, samples.detection)
-    back = (samples.tangent * samples.tangent[start]).sum(axis=1) < 0
-    return 2 * samples.detection + back
-
-
 class _Feet:
     """The best foot of each sample on each strand in reach, and which of them are still free."""
 
@@ -104,8 +96,7 @@ class _Feet:
         self.sample, self.station, self.offset, self.along = feet
         self.weight = samples.spacing[self.sample]
         self.gain = 1.0 - (self.offset / gate) ** 2
-        part = sides(samples)
-        self.detection = part[self.sample]
+        self.detection = samples.detection[self.sample]
         self.strands = int(unit.max()) + 1
         self.pair = self.detection * self.strands + unit[self.station]
         # One place of a line in one frame.
@@ -115,7 +106,7 @@ class _Feet:
         count = int(where.max()) + 1
         self.slot = samples.frame[self.sample] * count + where[self.station]
         self.free = np.ones(len(self.sample), bool)
-        total = np.bincount(part, samples.spacing)
+        total = np.bincount(samples.detection, samples.spacing)
         self.least = np.minimum(MIN_STRETCH, 0.6 * total)
 
     def pick(self, index: Int) -> Feet:

@@ -166,6 +166,7 @@ def _line_votes(
                 pairs,
                 stations,
                 picked,
+                settings.policy.new_log_odds,
             )
     return votes
 

@@ -43,8 +43,6 @@ OWN, CUT = 0.5, 1.3
 Gaussian that is cut in two (means at ± 0.8 σ)."""
 SHARED = 0.2
 """Correlation of the offsets that two drives have at a place."""
-NEW_LOG_ODDS = -1.3
-"""Log-odds of a candidate before the votes."""
 SURE = 3.0
 """Log-odds from which on a line of the map is not in question."""
 
@@ -94,11 +92,13 @@ def weighed(
     pairs: Int,
     stations: Stations,
     picked: Mask,
+    new_log_odds: float,
 ) -> Ballot:
     """The votes with the ``extra`` evidence of the ``asked`` stations added.
 
     In ``full`` every line takes part, in ``without`` those in question chose last; both hold the
-    drives that vote on them. ``sigma``: of every drive's samples.
+    drives that vote on them. ``sigma``: of every drive's samples; ``new_log_odds``: of a candidate
+    (``picked``) before the votes.
     """
     extra = votes.extra.copy()
     with_, alone = (_total(p.counts, votes.model, picked) for p in (full, without))
@@ -118,15 +118,17 @@ def weighed(
     out = replace(votes, extra=extra)
     if picked[asked].any():
         extra = extra.copy()
-        extra[giver] += _either(out, with_, alone, giver, taker)
+        extra[giver] += _either(out, with_, alone, giver, taker, new_log_odds)
         out = replace(out, extra=extra)
     return out
 
 
-def _either(votes: Ballot, with_: Array, alone: Array, giver: Int, taker: Int) -> Array:
+def _either(
+    votes: Ballot, with_: Array, alone: Array, giver: Int, taker: Int, new_log_odds: float
+) -> Array:
     """What stations of the map gain because a new line that takes their detections may not exist:
     the probability of either case weighs the answer in it."""
-    new = probability(votes.evidence[taker] + NEW_LOG_ODDS)
+    new = probability(votes.evidence[taker] + new_log_odds)
     cases = [log_odds_of(v[:, giver], votes.model) for v in (with_, alone)]
     p = [probability(c + PRIOR_LOG_ODDS) for c in cases]
     mixed = logit(new * p[0] + (1 - new) * p[1]) - PRIOR_LOG_ODDS
