@@ -2,65 +2,126 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rtmap_cli.geometry.rings import align, open_ring
-from rtmap_cli.maps.refit import DriveOffsets, FusionModel, combine, measured_share, solve_vertices
-from rtmap_cli.maps.stations import stations_of
+from rtmap_cli.maps.consensus import Sightings, consensus
+from rtmap_cli.maps.refit import FusionModel, solve_vertices
+from rtmap_cli.maps.stations import smoother, stations_of
 
-MODEL = FusionModel(place_share=0.0, floor=0.0, huber=1e9)
+MODEL = FusionModel()
+EXACT = FusionModel(floor=1e-6, huber=1e9)
+"""Without repeatability and without robust weights: what the equation says."""
 
 
-def _drive(offset: float, variance: float, frames: float = 1.0, n: int = 3) -> DriveOffsets:
-    return DriveOffsets(*(np.full(n, v) for v in (offset, variance, frames, 0.0)))
+def _drive(
+    offset: object, sigma: object, way: object = None, pose: float = 0.0, score: float = 1.0
+) -> Sightings:
+    """Frames of one drive at one station."""
+    offset = np.atleast_1d(np.asarray(offset, float))
+    n = len(offset)
+    driven = np.arange(n) * 2.5 if way is None else np.asarray(way, float)
+    return Sightings(
+        np.zeros(n, np.int64),
+        driven,
+        offset[:, None],
+        np.broadcast_to(np.asarray(sigma, float), n).copy(),
+        np.ones(n),
+        np.full(n, score),
+        np.full(n, pose),
+    )
 
 
-def test_drives_combine_by_information() -> None:
-    offset, variance = combine([_drive(1.0, 0.1), _drive(0.0, 0.3)], 1.0, MODEL)
-    assert np.allclose(offset, (1 / 0.1) / (1 / 0.1 + 1 / 0.3))
-    assert np.allclose(variance, 1 / (1 / 0.1 + 1 / 0.3))
+def _covariance(drives: list[Sightings], model: FusionModel) -> np.ndarray:
+    """Of all offsets, written down as the model says it."""
+    sigma = np.concatenate([d.sigma for d in drives])
+    way = np.concatenate([d.way for d in drives])
+    drive = np.concatenate([np.full(len(d), k) for k, d in enumerate(drives)])
+    pose = np.concatenate([d.pose for d in drives]) + model.floor**2
+    same = drive[:, None] == drive[None]
+    fade = np.exp(-np.abs(way[:, None] - way[None]) / model.memory_m)
+    share = model.place_share + same * (model.drive_share + model.memory_share * fade)
+    out = np.outer(sigma, sigma) * share + same * pose[:, None]
+    return out + np.diag(model.own_share * sigma**2)
+
+
+def test_the_consensus_is_the_generalised_least_squares_answer() -> None:
+    rng = np.random.default_rng(3)
+    drives = [
+        _drive(rng.normal(0, 0.3, n), rng.uniform(0.1, 0.8, n), pose=0.01 * k)
+        for k, n in enumerate((7, 1, 12))
+    ]
+    scaled = FusionModel(floor=1e-6, huber=1e9)
+    place, variance = consensus(drives, 1, scaled)
+    # The scale of the sigmas is measured from what is left; the answer must be that of its scale.
+    offset = np.concatenate([d.offset[:, 0] for d in drives])
+    best = []
+    for scale in np.linspace(0.5, 2.0, 301):
+        wide = [replace(d, sigma=d.sigma * scale) for d in drives]
+        inverse = np.linalg.inv(_covariance(wide, scaled))
+        information = inverse.sum()
+        x = (inverse @ offset).sum() / information
+        best.append((abs(1 / information - variance[0]), abs(x - place[0, 0])))
+    assert min(best)[1] < 2e-3
+
+
+def test_an_error_that_goes_with_sigma_is_told_from_the_line() -> None:
+    sigma = np.array([0.2, 0.3, 0.5, 0.8, 0.5, 0.3])
+    drives = [_drive(0.1 + b * sigma, sigma) for b in (0.6, 0.4, 0.9)]
+    place, _ = consensus(drives, 1, EXACT)
+    mean = np.mean([d.offset.mean() for d in drives])
+    assert abs(place[0, 0] - 0.1) < 0.05 < abs(mean - 0.1)
 
 
 def test_frames_of_one_drive_do_not_average_out_what_they_share() -> None:
-    _, once = combine([_drive(0.0, 0.2, frames=1)], 0.5, MODEL)
-    _, often = combine([_drive(0.0, 0.2, frames=1e9)], 0.5, MODEL)
-    assert np.allclose(once, 0.2) and np.allclose(often, 0.1)
-    _, four = combine([_drive(0.0, 0.2, frames=1e9)] * 4, 0.5, MODEL)
-    assert np.allclose(four, 0.1 / 4)
+    one = consensus([_drive(np.zeros(50), 0.4)], 1, MODEL)[1][0]
+    four = consensus([_drive(np.zeros(50), 0.4) for _ in range(4)], 1, MODEL)[1][0]
+    many = consensus([_drive(np.zeros(200), 0.4, np.arange(200) * 0.6)], 1, MODEL)[1][0]
+    assert four < 0.6 * one and many > 0.9 * one
+
+
+def test_a_car_that_stands_sees_nothing_new() -> None:
+    moving = consensus([_drive(np.zeros(30), 0.4)], 1, MODEL)[1][0]
+    standing = consensus([_drive(np.zeros(30), 0.4, np.zeros(30))], 1, MODEL)[1][0]
+    assert standing > moving
 
 
 def test_sigma_never_falls_below_repeatability() -> None:
-    model = FusionModel()
-    _, variance = combine([_drive(0.0, 1e-6)] * 1000, 0.5, model)
-    assert (variance >= model.floor**2).all()
+    _, variance = consensus([_drive(np.zeros(20), 0.01) for _ in range(100)], 1, MODEL)
+    assert (variance >= MODEL.floor**2).all()
 
 
-def test_one_drive_that_is_far_off_hardly_moves_the_mean() -> None:
-    good = [_drive(0.0, 0.01) for _ in range(4)]
-    plain, _ = combine([*good, _drive(1.4, 0.01)], 1.0, MODEL)
-    robust, _ = combine([*good, _drive(1.4, 0.01)], 1.0, FusionModel(huber=1.5))
-    assert np.all(robust < plain / 3)
+def test_one_drive_that_is_far_off_hardly_moves_the_consensus() -> None:
+    good = [_drive(np.zeros(8), 0.1) for _ in range(4)]
+    far = _drive(np.full(8, 1.4), 0.1)
+    plain, _ = consensus([*good, far], 1, EXACT)
+    robust, _ = consensus([*good, far], 1, MODEL)
+    assert robust[0, 0] < plain[0, 0] / 3
 
 
 def test_unseen_stations_stay_unknown() -> None:
-    offset, variance = combine([_drive(np.nan, np.nan, 0)], 0.5, MODEL)
+    offset, variance = consensus([_drive(np.zeros(0), 1.0)], 3, MODEL)
     assert np.isnan(offset).all() and np.isinf(variance).all()
+    offset, variance = consensus([_drive(np.zeros(4), 1.0)], 3, MODEL)
+    assert np.isfinite(offset[0]).all() and np.isnan(offset[1:]).all()
 
 
-def test_the_share_of_a_drive_is_measured_where_drives_overlap() -> None:
+def test_neighbours_tell_of_the_error_that_they_share() -> None:
+    line = np.stack([np.linspace(0, 60, 61), np.zeros(61)], axis=-1)
+    stations = stations_of([line])
     rng = np.random.default_rng(0)
-    wanted = 0.8
-    drives = [
-        DriveOffsets(
-            rng.normal(0, np.sqrt(wanted * 0.2), 4000),
-            np.full(4000, 0.2),
-            np.full(4000, 1e9),
-            np.zeros(4000),
-        )
-        for _ in range(6)
-    ]
-    assert abs(measured_share(drives, FusionModel(floor=0.0)) - wanted) < 0.12
-    assert measured_share(drives[:1], MODEL) == MODEL.drive_share
+    n, sigma = len(stations), np.array([0.2, 0.35, 0.6])
+    rows = np.repeat(np.arange(n), 3)
+    noise = np.concatenate([0.5 * sigma + rng.normal(0, 0.3, 3) * sigma for _ in range(n)])
+    drive = Sightings(
+        rows, np.tile([0.0, 15, 30], n), noise[:, None], np.tile(sigma, n), *np.ones((2, 3 * n)),
+        np.zeros(3 * n),
+    )  # fmt: skip
+    alone, _ = consensus([drive], n, MODEL)
+    pooled, _ = consensus([drive], n, MODEL, smoother(stations, MODEL.shared_m))
+    assert np.abs(pooled).mean() < 0.8 * np.abs(alone).mean()
 
 
 def test_on_a_straight_line_a_vertex_moves_across_only() -> None:

@@ -71,7 +71,13 @@ class Traversal:
     @property
     def kilometres(self) -> float:
         """Distance driven between its frames."""
-        return float(np.hypot(*np.diff(self.pose[:, :2], axis=0).T).sum()) / 1000
+        return float(self.way[-1]) / 1000 if len(self.way) else 0.0
+
+    @cached_property
+    def way(self) -> Array:
+        """(m,) metres driven until each frame."""
+        step = np.hypot(*np.diff(self.pose[:, :2], axis=0).T)
+        return np.concatenate([[0.0], np.cumsum(step)])
 
     @cached_property
     def outlook(self) -> Outlook:

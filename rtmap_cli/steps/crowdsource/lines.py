@@ -9,16 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import is_ring, tangents
-from rtmap_cli.logs.traversal import Traversal, pose_variance
-from rtmap_cli.maps.refit import (
-    FusionModel,
-    combine,
-    drive_offsets,
-    measured_share,
-    solve_vertices,
-)
+from rtmap_cli.logs.offsets import fused_offsets
+from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.refit import FusionModel, solve_vertices
 from rtmap_cli.maps.registration import registered
-from rtmap_cli.maps.stations import Stations, assign, smoother, stations_of
+from rtmap_cli.maps.stations import Stations, stations_of
 
 Array = NDArray[np.float64]
 
@@ -156,24 +151,10 @@ def _offsets(
 ) -> tuple[Array, Array]:
     """Offset and variance of every station over the traversals (NaN, inf where unseen); with
     ``known`` lines what these show as displaced is put back first."""
-    n = len(stations)
-    if not traversals:
-        return np.full(n, np.nan), np.full(n, np.inf)
-    smooth = smoother(stations, model.width)
-    drives = []
-    for traversal in traversals:
-        samples = traversal.samples(class_name)
-        if known is not None:
-            samples = registered(samples, known)
-        feet, _ = assign(stations, samples)
-        noise = pose_variance(
-            traversal,
-            samples.frame[feet.sample],
-            samples.xy[feet.sample],
-            stations.normal[feet.station],
-        )
-        drives.append(drive_offsets(stations, smooth, samples, feet, noise, model))
-    return combine(drives, measured_share(drives, model), model)
+    samples = [t.samples(class_name) for t in traversals]
+    if known is not None:
+        samples = [registered(s, known) for s in samples]
+    return fused_offsets(stations, traversals, samples, model)
 
 
 def snap_ends(points: list[Array], new: Sequence[bool], reach: float, angle: float) -> None:

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.rings import align, close, open_ring, open_rings, simplified
-from rtmap_cli.logs.traversal import Traversal
-from rtmap_cli.maps.refit import SHARPNESS, FusionModel
+from rtmap_cli.logs.traversal import Traversal, pose_variance
+from rtmap_cli.maps.consensus import Sightings, consensus
+from rtmap_cli.maps.refit import FusionModel
 from rtmap_cli.steps.crowdsource.lines import LONGEST_MOVE, Fused, columns, planar
 
 Array = NDArray[np.float64]
@@ -22,34 +23,6 @@ NEAR, REACH, FARTHEST = 3.5, 2.2, 8.0
 within so many of its sigmas and this distance (m)."""
 WHOLE = 0.25
 """Log of how much longer or shorter the outline of a detection at the border may be."""
-
-
-def _drive_mean(
-    rings: Array, variance: Array, score: Array, reference: Array, model: FusionModel
-) -> tuple[Array, float]:
-    """Mean outline of one drive's detections and the variance per axis of its points."""
-    weight = score / variance**SHARPNESS
-    aligned = align(rings, reference)
-    mean = (aligned * weight[:, None, None]).sum(0) / weight.sum()
-    effective = weight.sum() ** 2 / (weight**2).sum()
-    single = float((weight * variance).sum() / weight.sum())
-    share = model.drive_share
-    return mean, single * (share + (1 - share) / effective) + model.floor**2
-
-
-def _combined(
-    means: Array, variances: Array, base: Array | None, model: FusionModel
-) -> tuple[Array, Array]:
-    """Outline over the drives (k, n, 2) with per-point Huber weights, and its variance (n,)."""
-    centre = np.median(means, axis=0) if base is None else base
-    weight = 1.0 / variances[:, None]
-    for _ in range(4):
-        z = np.hypot(*np.moveaxis(means - centre, -1, 0)) / np.sqrt(2 * variances[:, None])
-        w = weight * np.minimum(1.0, model.huber / np.maximum(z, 1e-9))
-        centre = (means * w[..., None]).sum(0) / w.sum(0)[:, None]
-    information = (w / weight / variances[:, None]).sum(axis=0)
-    common = model.place_share * variances.min() + model.floor**2 + model.common
-    return centre, 1.0 / information + common
 
 
 def fuse_ring(
@@ -66,22 +39,12 @@ def fuse_ring(
     the outline has at its place, by Eq. 5 with its own covariance.
     """
     reference = open_ring(points)
-    means, variances = [], []
-    for traversal in traversals:
-        index = _near(traversal, class_name, reference)
-        if not len(index):
-            continue
-        rings = open_rings(traversal.points[index])
-        cov = traversal.covariance[index]
-        variance = np.maximum((cov[..., 0, 0] + cov[..., 1, 1]).mean(axis=1) / 2, 0.01)
-        pose = traversal.pose_covariance[traversal.frame[index]]
-        mean, own = _drive_mean(rings, variance, traversal.score[index], reference, model)
-        means.append(mean)
-        variances.append(own + float((pose[:, 0, 0] + pose[:, 1, 1]).mean() / 2))
-    if not means:
+    drives = [_sightings(t, _near(t, class_name, reference), reference) for t in traversals]
+    moves, variances = consensus([d for d in drives if len(d)], 1, model)
+    if not np.isfinite(variances[0]):
         return Fused(points, covariance, False)
-    base = None if new else reference
-    outline, variance = _combined(np.stack(means), np.array(variances), base, model)
+    outline = reference + moves[0].reshape(-1, 2)
+    variance = np.full(len(reference), variances[0] + model.common)
     if new:
         ring = simplified(outline, SIMPLIFY)
         near = np.argmin(np.hypot(*np.moveaxis(ring[:, None] - outline, -1, 0)), axis=1)
@@ -89,6 +52,26 @@ def fuse_ring(
         heights = np.full(len(ring), np.nan)
         return Fused(np.column_stack([ring, heights]), columns(spread, None), True)
     return _moved(points, covariance, reference, outline, variance)
+
+
+def _sightings(traversal: Traversal, index: Int, reference: Array) -> Sightings:
+    """Detections ``index`` of one element as offsets of its outline, point by point; the whole
+    outline is one station."""
+    rings = align(open_rings(traversal.points[index]), reference)
+    frame = traversal.frame[index]
+    cov = traversal.covariance[index]
+    variance = (cov[..., 0, 0] + cov[..., 1, 1]).mean(axis=1) / 2
+    centre = np.tile(reference.mean(axis=0), (len(index), 1))
+    axes = [pose_variance(traversal, frame, centre, np.tile(a, (len(index), 1))) for a in np.eye(2)]
+    return Sightings(
+        np.zeros(len(index), np.int64),
+        traversal.way[frame],
+        (rings - reference).reshape(len(index), 2 * len(reference)),
+        np.sqrt(np.maximum(variance, 0.01)),
+        np.ones(len(index)),
+        traversal.score[index],
+        (axes[0] + axes[1]) / 2,
+    )
 
 
 def _near(traversal: Traversal, class_name: str, reference: Array) -> Int:

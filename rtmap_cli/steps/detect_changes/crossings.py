@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.rings import align, open_rings, overlap, polygons
 from rtmap_cli.logs.traversal import Traversal
-from rtmap_cli.maps.refit import SHARPNESS
 from rtmap_cli.maps.visibility import Views
 from rtmap_cli.steps.detect_changes.votes import (
     DriveCounts,
@@ -23,6 +22,9 @@ from rtmap_cli.steps.detect_changes.votes import (
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+SHARPNESS = 1.5
+"""In a mean outline a detection weighs score / variance ** SHARPNESS: its error is mostly shared
+with the others, in proportion to its sigma."""
 NEAR = 3.5
 """Rings whose features (centre, direction) differ by more than this (m) are different ones."""
 SIGMAS = 3.0

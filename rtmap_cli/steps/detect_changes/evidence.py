@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import is_ring, length
 from rtmap_cli.geometry.rings import RING_POINTS, close, open_ring
+from rtmap_cli.logs.offsets import fused_offsets
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.assignment import assign_once, offset_sigma
 from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
@@ -35,7 +36,6 @@ from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, rin
 from rtmap_cli.steps.detect_changes.doubles import split_doubles
 from rtmap_cli.steps.detect_changes.lines import (
     all_line_counts,
-    fused_offsets,
     joined_lines,
     new_lines,
     refit_lines,

@@ -7,22 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.logs.traversal import Traversal, pose_variance
+from rtmap_cli.logs.offsets import fused_offsets
+from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.assignment import assign_once
-from rtmap_cli.maps.refit import (
-    FusionModel,
-    combine,
-    drive_offsets,
-    measured_share,
-    solve_vertices,
-)
+from rtmap_cli.maps.refit import FusionModel, solve_vertices
 from rtmap_cli.maps.sight import SightModel
 from rtmap_cli.maps.stations import (
     Samples,
     Stations,
-    assign,
     loose_stretches,
-    smoother,
     stations_of,
 )
 from rtmap_cli.steps.detect_changes.field import BLOCK, CELL, Marks, blocks
@@ -117,24 +110,6 @@ def refit_lines(
     moved *= np.minimum(1.0, 1.0 / np.maximum(size, 1e-9))[:, None]
     xy = stations.xy[mine] + moved
     return [xy[stations.line[mine] == k + len(others)] for k in range(len(lines))]
-
-
-def fused_offsets(
-    stations: Stations,
-    traversals: Sequence[Traversal],
-    samples: Sequence[Samples],
-    model: FusionModel,
-) -> tuple[Array, Array]:
-    """Offset and variance of every station over all drives (NaN, inf where none)."""
-    smooth = smoother(stations, model.width)
-    drives = []
-    for traversal, s in zip(traversals, samples, strict=True):
-        feet, _ = assign(stations, s)
-        noise = pose_variance(
-            traversal, s.frame[feet.sample], s.xy[feet.sample], stations.normal[feet.station]
-        )
-        drives.append(drive_offsets(stations, smooth, s, feet, noise, model))
-    return combine(drives, measured_share(drives, model), model)
 
 
 def all_line_counts(
