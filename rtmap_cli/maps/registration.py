@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.maps.assignment import assign_once, offset_sigma
+from rtmap_cli.maps.assignment import assign_once, sigma_scale
 from rtmap_cli.maps.stations import Samples, Stations
 
 Array = NDArray[np.float64]
@@ -29,6 +29,8 @@ OWN = 0.4
 """Share of a detection's variance that is its own: no other line near it has that offset."""
 MAP_SIGMA = 0.1
 """Standard deviation (m) of the map."""
+SMALLEST = 0.1
+"""Standard deviation (m) of a detection at least."""
 HUBER = 1.5
 
 
@@ -51,13 +53,15 @@ def registered(samples: Samples, known: Stations) -> Samples:
     votes = _votes(samples, known)
     if not len(votes.offset):
         return samples
-    return replace(samples, xy=samples.xy - _field(votes, samples.xy), last=[])
+    size = np.maximum(sigma_scale(known, samples) * samples.across_sigma, SMALLEST)
+    moved = samples.xy - _field(votes, samples.xy) * size[:, None]
+    return replace(samples, xy=moved, last=[])
 
 
 def _votes(samples: Samples, known: Stations) -> _Votes:
     """One vote per stretch of a line."""
     feet, _ = assign_once(known, samples)
-    sigma = offset_sigma(known, samples)[feet.sample]
+    sigma = np.maximum(sigma_scale(known, samples) * samples.across_sigma, SMALLEST)[feet.sample]
     along = np.floor(known.s[feet.station] / CELL).astype(np.int64)
     line = known.line[feet.station]
     _, key = np.unique(line * (int(along.max(initial=0)) + 1) + along, return_inverse=True)
@@ -68,13 +72,12 @@ def _votes(samples: Samples, known: Stations) -> _Votes:
 
     normal = np.stack([mean(known.normal[feet.station, k]) for k in (0, 1)], axis=-1)
     normal /= np.maximum(np.hypot(*normal.T), 1e-9)[:, None]
-    variance = mean(sigma**2)
     return _Votes(
         np.stack([mean(samples.xy[feet.sample, k]) for k in (0, 1)], axis=-1),
         normal,
-        mean(feet.offset),
-        OWN * variance + MAP_SIGMA**2,
-        (1 - OWN) * variance,
+        mean(feet.offset / sigma),
+        OWN + MAP_SIGMA**2 * mean(sigma**-2),
+        np.full(len(number), 1 - OWN),
     )
 
 
