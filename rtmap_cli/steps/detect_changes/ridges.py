@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-TIP = 2.5
+TIP = 3.0
 """Ends side by side, so near (m) and looking the same way, are the tip of an outline."""
 
 
