@@ -138,8 +138,12 @@ def consensus(
         measured = float(np.clip(np.median(ratio) / (0.674 * LEFT), 0.5, 2.0))
         scale = measured ** (len(number) / (len(number) + 100.0))
         robust = np.minimum(1.0, 1.5 * model.huber / np.maximum(ratio / scale, 1e-9))
-    seen = np.bincount(station, minlength=n) > 0
-    variance = np.where(seen, covariance[:, 0, 0] + model.floor**2, np.inf)
+    count = np.bincount(station, minlength=n)
+    seen = count > 0
+    # Drives that disagree by more than they should know less than they say (Birge's ratio).
+    birge = np.maximum(np.bincount(station, z**2, n) / np.maximum(count - 1, 1), 1.0)
+    birge[count < 2] = 1.0
+    variance = np.where(seen, covariance[:, 0, 0] * birge + model.floor**2, np.inf)
     return np.where(seen[:, None], place[:, 0], np.nan), variance
 
 

@@ -44,7 +44,7 @@ class FusionModel:
     memory_m: float = 15.0
     shared_m: float = 8.0
     own_share: float = 0.1
-    floor: float = 0.07
+    floor: float = 0.05
     huber: float = 1.5
     common: float = 0.0
 

@@ -111,7 +111,7 @@ def fuse_lines(
             out.append(Fused(p, covariances[k], False))
             continue
         xy = p[:, :2] + move[part]
-        cov = after[part] + np.eye(2) * (model.floor**2 * 0.25 + model.common)
+        cov = after[part] + np.eye(2) * (model.floor**2 + model.common)
         if is_new[k]:
             cov = _known_along(cov, xy)
         if is_ring(p):
