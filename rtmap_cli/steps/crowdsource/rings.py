@@ -18,6 +18,8 @@ Int = NDArray[np.int64]
 
 SIMPLIFY = 0.25
 """A vertex of a new outline that lies so near (m) to the line of its neighbours is left out."""
+SMOOTH = 1.5
+"""Single vertices are noisy: offsets of an outline are smoothed along it over so much (m)."""
 NEAR, REACH, FARTHEST = 3.5, 2.2, 8.0
 """A detection whose centre is farther (m) from the element's is not averaged, unless that is
 within so many of its sigmas and this distance (m)."""
@@ -43,7 +45,7 @@ def fuse_ring(
     moves, variances = consensus([d for d in drives if len(d)], 1, model)
     if not np.isfinite(variances[0]):
         return Fused(points, covariance, False)
-    outline = reference + moves[0].reshape(-1, 2)
+    outline = reference + _smooth(moves[0].reshape(-1, 2), reference)
     variance = np.full(len(reference), variances[0] + model.common)
     if new:
         ring = simplified(outline, SIMPLIFY)
@@ -52,6 +54,15 @@ def fuse_ring(
         heights = np.full(len(ring), np.nan)
         return Fused(np.column_stack([ring, heights]), columns(spread, None), True)
     return _moved(points, covariance, reference, outline, variance)
+
+
+def _smooth(offset: Array, reference: Array) -> Array:
+    """Offsets (n, 2) smoothed along the outline, over ``SMOOTH`` metres."""
+    from scipy.ndimage import gaussian_filter1d
+
+    step = float(_outline(reference[None])[0]) / len(reference)
+    out: Array = gaussian_filter1d(offset, SMOOTH / max(step, 1e-3), axis=0, mode="wrap")
+    return out
 
 
 def _sightings(traversal: Traversal, index: Int, reference: Array) -> Sightings:
