@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from rtmap_cli.geometry.rings import align, open_ring
-from rtmap_cli.maps.consensus import Sightings, consensus
+from rtmap_cli.maps.consensus import Sightings, along, consensus
 from rtmap_cli.maps.refit import FusionModel, solve_vertices
-from rtmap_cli.maps.stations import smoother, stations_of
+from rtmap_cli.maps.stations import stations_of
 
 MODEL = FusionModel()
 EXACT = FusionModel(floor=1e-6, huber=1e9)
@@ -118,7 +118,7 @@ def test_neighbours_tell_of_the_error_that_they_share() -> None:
         np.zeros(3 * n),
     )  # fmt: skip
     alone, _ = consensus([drive], n, MODEL)
-    pooled, _ = consensus([drive], n, MODEL, smoother(stations, MODEL.shared_m))
+    pooled, _ = consensus([drive], n, MODEL, along(stations, MODEL.shared_m))
     assert np.abs(pooled).mean() < 0.8 * np.abs(alone).mean()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.logs.traversal import Traversal, pose_variance
-from rtmap_cli.maps.consensus import consensus, sightings
+from rtmap_cli.maps.consensus import along, consensus, sightings
 from rtmap_cli.maps.refit import FusionModel
 from rtmap_cli.maps.stations import Samples, Stations, assign, smoother
 
@@ -34,5 +34,5 @@ def fused_offsets(
             traversal, s.frame[feet.sample], s.xy[feet.sample], stations.normal[feet.station]
         )
         drives.append(sightings(stations, smooth, s, feet, noise, traversal.way))
-    offset, variance = consensus(drives, n, model, smoother(stations, model.shared_m))
+    offset, variance = consensus(drives, n, model, along(stations, model.shared_m))
     return offset[:, 0], variance

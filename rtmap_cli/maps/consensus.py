@@ -34,6 +34,8 @@ COVERED = 0.05
 """What covers less than this share of the surroundings of a station says nothing about it."""
 LEFT = 0.8
 """Of the spread around a line that much is left around the fitted one, within the gate."""
+FAR = 20.0
+"""Added to logarithms so that none is zero."""
 ROUNDS = 2
 """Times that the weights of outliers are found anew."""
 
@@ -84,28 +86,51 @@ def sightings(
     frames, column = np.unique(samples.frame[sample], return_inverse=True)
     shape = n, len(frames)
 
-    def around(values: Array) -> Any:
-        # The weight in the real part: a sum of values that is zero would be dropped.
-        matrix = coo_matrix((weight * (1 + 1j * values), (feet.station, column)), shape).tocsr()
-        out = (smooth @ matrix).tocsr()
+    def around(real: Array, imaginary: Array) -> Any:
+        # Two sums in one product; the real part is never zero, else it would be dropped.
+        matrix = coo_matrix((weight * (real + 1j * imaginary), (feet.station, column)), shape)
+        out = (smooth @ matrix.tocsr()).tocsr()
         out.sort_indices()
         return out
 
-    parts = [around(v) for v in (feet.offset, log_sigma, samples.score[sample], pose_variance)]
-    pattern = parts[0]
-    row = np.repeat(np.arange(n), np.diff(pattern.indptr))
-    cover = pattern.data.real / (smooth @ stations.spacing)[row]
+    offsets = around(np.ones(len(feet)), feet.offset)
+    others = around(log_sigma + FAR, samples.score[sample])
+    row = np.repeat(np.arange(n), np.diff(offsets.indptr))
+    cover = offsets.data.real / (smooth @ stations.spacing)[row]
     ok = np.flatnonzero(cover > COVERED)
-    mean = [part.data.imag[ok] / part.data.real[ok] for part in parts]
+    row, total = row[ok], offsets.data.real[ok]
+    pose = smooth @ np.bincount(feet.station, weight * pose_variance, n)
+    pose /= np.maximum(smooth @ np.bincount(feet.station, weight, n), 1e-9)
     return Sightings(
-        row[ok],
-        way[frames[pattern.indices[ok]]],
-        mean[0][:, None],
-        np.exp(mean[1]),
+        row,
+        way[frames[offsets.indices[ok]]],
+        (offsets.data.imag[ok] / total)[:, None],
+        np.exp(others.data.real[ok] / total - FAR),
         np.minimum(cover[ok], 1.0),
-        mean[2],
-        mean[3],
+        others.data.imag[ok] / total,
+        pose[row],
     )
+
+
+def along(stations: Stations, width: float) -> Any:
+    """Sparse (n, n) Gaussian weights between stations of a line by the way along it, ``width`` (m)
+    one sigma; those where the line has turned by more than 60° do not count."""
+    from scipy.sparse import coo_matrix
+
+    n = len(stations)
+    index = np.arange(n)
+    pairs = [(index, index, np.ones(n))]
+    for step in range(1, n):
+        i, j = index[:-step], index[step:]
+        far = np.where(stations.line[i] == stations.line[j], stations.s[j] - stations.s[i], np.inf)
+        near = far <= 3 * width
+        if not near.any():
+            break
+        near &= (stations.tangent[i] * stations.tangent[j]).sum(axis=1) > 0.5
+        weight = np.exp(-0.5 * (far[near] / width) ** 2)
+        pairs += [(i[near], j[near], weight), (j[near], i[near], weight)]
+    row, column, weight = (np.concatenate(p) for p in zip(*pairs, strict=True))
+    return coo_matrix((weight, (row, column)), shape=(n, n)).tocsr()
 
 
 def consensus(
