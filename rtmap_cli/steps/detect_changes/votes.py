@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+TOGETHER = 3
+"""Feet of a detection that are so many stations apart, or nearer, cover those between them."""
 SEEN_SHARE = 0.3
 """A drive has seen a place when it found something in this share of the usual rate."""
 CONFIRMED = 0.35
@@ -181,27 +183,42 @@ def line_counts(
     n, outlook = len(stations), traversal.outlook
     cell = outlook.cells(stations.xy)
     views_ = outlook.counted(margin, sight)[cell] * sight.curve("to_end", stations.to_end)
-    keys, values, scores = [], [], []
-    frame, score = samples.frame[feet.sample], samples.score[feet.sample]
-    value = detection_value(score)
-    wide = samples.spacing[feet.sample] > STEP
-    for shift in (0, -1, 1):
-        place = np.clip(feet.station + shift, 0, n - 1)
-        ok = stations.line[place] == stations.line[feet.station]
-        # Detections with vertices far apart cover the stations between them, too.
-        ok &= wide | (shift == 0) | (np.sign(feet.along) == shift)
-        keys.append((frame * n + place)[ok])
-        values.append(value[ok])
-        scores.append(score[ok])
+    key, score = _covered(stations, samples, feet)
     asked_key, existence = _asked_stations(stations, ids, traversal)
-    keys.append(asked_key)
-    values.append(answer_value(existence))
-    scores.append(existence)
-    key, value, score = _best_hits(*map(np.concatenate, (keys, values, scores)))
+    value = np.concatenate([detection_value(score), answer_value(existence)])
+    key, value, score = _best_hits(
+        np.concatenate([key, asked_key]), value, np.concatenate([score, existence])
+    )
     at, place = np.divmod(key, n)
-    ok = outlook.sees(at, cell[place], margin)
+    ok = outlook.sees_in_turn(at, cell[place], margin)
     looked = CellLooks(outlook, cell, margin)
     return _counted(n, looked, views_, key[ok], value[ok], score[ok])
+
+
+def _covered(stations: Stations, samples: Samples, feet: Feet) -> tuple[Int, Array]:
+    """Frame · n + station of all stations that detections cover, and the scores of these.
+
+    What a detection covers of a line is a stretch from its first to its last foot. Detections
+    with vertices far apart cover the stations beside these, too.
+    """
+    n = len(stations)
+    if not len(feet):
+        return np.zeros(0, np.int64), np.zeros(0)
+    station, line = feet.station, stations.line[feet.station]
+    detection = samples.detection[feet.sample]
+    change = np.ones(len(feet), bool)
+    change[1:] = (detection[1:] != detection[:-1]) | (line[1:] != line[:-1])
+    change[1:] |= np.abs(np.diff(station)) > TOGETHER
+    start = np.flatnonzero(change)
+    wide = samples.spacing[feet.sample] > STEP
+    low = np.minimum.reduceat(station - (wide | (feet.along < 0)), start)
+    high = np.maximum.reduceat(station + (wide | (feet.along > 0)), start)
+    bounds = np.searchsorted(stations.line, [line[start], line[start] + 1])
+    low, high = np.maximum(low, bounds[0]), np.minimum(high, bounds[1] - 1)
+    count = high - low + 1
+    first = feet.sample[start]
+    key = np.repeat(samples.frame[first] * n + low - (np.cumsum(count) - count), count)
+    return key + np.arange(len(key)), np.repeat(samples.score[first], count)
 
 
 def _asked_stations(
