@@ -43,16 +43,13 @@ class Nearby:
     start: Int
     stop: Int
 
-    def candidates(self, points: Array) -> tuple[Int, Int]:
-        """Pairs of a point (index into (m, 2), ascending) and the station of a stretch near it that
-        is nearest along the line; a station may come twice."""
-        return self.feet(points)[:2]
-
     def feet(self, points: Array) -> tuple[Int, Int, Array, Array]:
-        """``candidates`` of points (m, 2), and how far (m) each point lies along and to the left of
-        the tangent of its station."""
+        """Pairs of a point (index into (m, 2), ascending) and the station of a stretch near it that
+        is nearest along the line (a station may come twice), and how far (m) the point lies along
+        and to the left of the tangent of the station."""
         px, py = np.ascontiguousarray(points.T)
-        column, row = (np.floor(v / CELL).astype(np.int64) - low for v, low in zip((px, py), self.low, strict=True))
+        column = np.floor(px / CELL).astype(np.int64) - self.low[0]
+        row = np.floor(py / CELL).astype(np.int64) - self.low[1]
         inside = (column >= 0) & (row >= 0) & (column < self.shape[0]) & (row < self.shape[1])
         row = self._rows(np.where(inside, column * self.shape[1] + row, -1))
         i = np.flatnonzero(row >= 0)
@@ -66,9 +63,8 @@ class Nearby:
         sx, sy, tx, ty = self._columns
         px, py = px[i], py[i]
         step = (px - sx[j]) * tx[j] + (py - sy[j]) * ty[j]
-        j = j + np.rint(step / self.gap[j]).astype(np.int64)
-        np.maximum(j, self.start[self.station[entry]], out=j)
-        np.minimum(j, self.stop[self.station[entry]], out=j)
+        moved = j + np.rint(step / self.gap[j]).astype(np.int64)
+        j = np.minimum(np.maximum(moved, self.start[j]), self.stop[j])
         px -= sx[j]
         py -= sy[j]
         x, y = tx[j], ty[j]

@@ -132,9 +132,10 @@ class Outlook:
         return np.repeat(seen, np.diff(first, append=len(cell)))
 
     def clear(self, frame: Int, xy: Array, margin: float) -> Array:
-        """(n,) distance (m) of places (n, 2) from a frame, -1 where it could not see them."""
+        """(...) distance (m) of places (..., 2) from a ``frame`` (of a shape that broadcasts), -1
+        where it could not see them."""
         c, s = np.cos(self.pose[:, 2])[frame], np.sin(self.pose[:, 2])[frame]
-        dx, dy = (xy[:, k] - self.pose[:, k][frame] for k in (0, 1))
+        dx, dy = (xy[..., k] - self.pose[:, k][frame] for k in (0, 1))
         x, y = c * dx + s * dy, c * dy - s * dx
         x0, y0, x1, y1 = self.range_m
         inside = (x >= x0 + margin) & (x <= x1 - margin) & (y >= y0 + margin) & (y <= y1 - margin)

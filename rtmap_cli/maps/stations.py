@@ -112,10 +112,15 @@ class Samples:
         return len(self.xy)
 
     @cached_property
+    def planar(self) -> Array:
+        """(3, n) xx, xy, yy of the covariances, each in a row of its own (m²)."""
+        return np.ascontiguousarray(self.covariance.reshape(-1, 4)[:, [0, 1, 3]].T)
+
+    @cached_property
     def across_sigma(self) -> Array:
         """(n,) standard deviation of each sample across its own detection, metres."""
         tx, ty = self.tangent.T
-        xx, xy, yy = (self.covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        xx, xy, yy = self.planar
         return np.asarray(np.sqrt(ty * ty * xx - 2 * tx * ty * xy + tx * tx * yy))
 
 
@@ -251,6 +256,18 @@ def _hairpins(xy: Array, step: Array) -> NDArray[np.bool_]:
 
     The two sides of a narrow island come in one detection, but are two lines.
     """
+    out = np.zeros(step.shape[:1] + (step.shape[1] + 1,), bool)
+    # Where every step is within 60° of the chord, no two parts differ by more than 120°.
+    chord = xy[:, -1] - xy[:, 0]
+    ahead = np.diff(xy[..., 0], axis=1) * chord[:, :1] + np.diff(xy[..., 1], axis=1) * chord[:, 1:]
+    bent = np.flatnonzero((ahead <= 0.5 * step * np.hypot(*chord.T)[:, None]).any(axis=1))
+    if len(bent):
+        out[bent] = _turns(xy[bent], step[bent])
+    return out
+
+
+def _turns(xy: Array, step: Array) -> NDArray[np.bool_]:
+    """``_hairpins`` of detections that do not run straight on."""
     n, k = xy.shape[:2]
     reach = np.clip(np.round(HAIRPIN / np.maximum(step.mean(axis=1), 1e-3)), 2, k // 3).astype(int)
     index, rows = np.arange(k), np.arange(n)[:, None]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -85,6 +86,19 @@ class DriveCounts:
     hit_place: Int
     hit_frame: Int
     hit_score: Array
+
+    @cached_property
+    def _by_place(self) -> tuple[Int, Int]:
+        """The hits in order of their places, and where those of each place begin."""
+        first = np.concatenate([[0], np.cumsum(np.bincount(self.hit_place, None, len(self.hits)))])
+        return np.argsort(self.hit_place, kind="stable"), first
+
+    def hits_at(self, index: Int) -> Int:
+        """The hits at the places ``index``, in their order."""
+        order, first = self._by_place
+        count = first[index + 1] - first[index]
+        at = np.repeat(first[index] - (np.cumsum(count) - count), count) + np.arange(count.sum())
+        return np.sort(order[at])
 
 
 def detection_value(score: Array) -> Array:
@@ -298,9 +312,7 @@ class Ballot:
         drive, time = self.drives[k], self.times[k]
         if not drive.views[index].any():
             return None
-        mine = np.zeros(self.votes.shape[-1], bool)
-        mine[index] = True
-        found = mine[drive.hit_place]
+        found = drive.hits_at(index)
         view_frames = _mostly(drive.looks.frames(index), len(time))
         hit_frames = np.flatnonzero(_mostly(drive.hit_frame[found], len(time)) & view_frames)
         score = drive.hit_score[found]
