@@ -52,7 +52,7 @@ def test_feet_are_those_of_a_full_search(monkeypatch):
 
 def test_points_elsewhere_find_nothing():
     stations = stations_of([np.array([[0.0, 0.0], [20.0, 0.0]])])
-    i, j = stations.near(GATE).candidates(np.array([[1e7, 0.0], [10.2, 0.3], [0.0, -50.0]]))
+    i, j, *_ = stations.near(GATE).feet(np.array([[1e7, 0.0], [10.2, 0.3], [0.0, -50.0]]))
     assert i.tolist() == [1] and j.tolist() == [10]
 
 

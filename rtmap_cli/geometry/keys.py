@@ -19,3 +19,15 @@ def packed(*columns: NDArray[np.integer]) -> Int:
             low = int(column.min())
             out = out * (int(column.max()) - low + 1) + (column - low)
     return out
+
+
+def numbered(keys: Int) -> tuple[Int, Int]:
+    """The different ``keys`` (n,) in order, and the place of each key among them.
+
+    As ``numpy.unique`` with its inverse, but what repeats in a row is sorted once.
+    """
+    if not len(keys):
+        return keys, np.zeros(0, np.int64)
+    start = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
+    some, place = np.unique(keys[start], return_inverse=True)
+    return some, np.repeat(place, np.diff(start, append=len(keys)))

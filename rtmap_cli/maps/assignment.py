@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.keys import numbered
 from rtmap_cli.maps.stations import (
     GATE,
     MIN_STRETCH,
@@ -104,7 +105,8 @@ class _Feet:
         size = int(place.max()) + 1
         where = stations.line * size + place
         count = int(where.max()) + 1
-        self.slot = samples.frame[self.sample] * count + where[self.station]
+        self.frame = samples.frame[self.sample]
+        self.slot = self.frame * count + where[self.station]
         self.free = np.ones(len(self.sample), bool)
         total = np.bincount(samples.detection, samples.spacing)
         self.least = np.minimum(MIN_STRETCH, 0.6 * total)
@@ -121,7 +123,7 @@ class _Feet:
         index = np.flatnonzero(open_)
         if not len(index):
             return index
-        pairs, inverse = np.unique(self.pair[index], return_inverse=True)
+        pairs, inverse = numbered(self.pair[index])
         weight = self.weight[index]
         gain = np.bincount(inverse, weight * self.gain[index])
         cover = np.bincount(inverse, weight)
@@ -131,29 +133,49 @@ class _Feet:
         best = np.zeros(len(pairs), bool)
         best[order] = np.concatenate([[True], owner[order][1:] != owner[order][:-1]])
         wanted = (best & enough)[inverse]
-        mean = (gain / np.maximum(cover, 1e-9))[inverse][wanted]
-        index = index[wanted]
+        mean = gain / np.maximum(cover, 1e-9)
+        index, inverse = index[wanted], inverse[wanted]
         if not len(index):
             return index
-        winners = self._winners(index, mean)
+        winners = np.ones(len(index), bool)
+        rivals = self._contested(index, inverse)
+        if len(rivals):
+            winners[rivals] = self._winners(index[rivals], mean[inverse[rivals]])
         # What lost most of its way along a line is another line, with its ends, too.
-        _, group = np.unique(self.pair[index], return_inverse=True)
-        won = np.bincount(group, self.weight[index] * winners) / np.bincount(
-            group, self.weight[index]
-        )
-        winners &= won[group] >= 0.5
+        weight = self.weight[index]
+        total = np.bincount(inverse, weight, len(pairs))
+        won = np.bincount(inverse, weight * winners, len(pairs)) / np.maximum(total, 1e-30)
+        winners &= won[inverse] >= 0.5
         self.free[index] = False
         kept = index[winners]
-        self._close(kept)
+        self._close(kept, taken)
         return kept
 
-    def _close(self, kept: Int) -> None:
+    def _close(self, kept: Int, taken: Mask) -> None:
         """Places filled by ``kept`` are closed to other detections of their frames."""
+        own = taken.copy()
+        own[self.sample[kept]] = True
+        rest = np.flatnonzero(self.free & ~own[self.sample])
+        if not len(rest) or not len(kept):
+            return
         slots, first = np.unique(self.slot[kept], return_index=True)
-        at = np.minimum(np.searchsorted(slots, self.slot), max(len(slots) - 1, 0))
-        if len(slots):
-            filled = slots[at] == self.slot
-            self.free &= ~filled | (self.detection == self.detection[kept][first][at])
+        slot = self.slot[rest]
+        at = np.minimum(np.searchsorted(slots, slot), len(slots) - 1)
+        filled = slots[at] == slot
+        other = self.detection[rest] != self.detection[kept][first][at]
+        self.free[rest[filled & other]] = False
+
+    def _contested(self, index: Int, pair: Int) -> Int:
+        """Which of the feet ``index`` belong to a ``pair`` (n,), numbered, that is not alone on its
+        strand in its frame: most are, and nobody contests their places."""
+        first = np.flatnonzero(np.diff(pair, prepend=-1))
+        some, at = np.unique(pair[first], return_index=True)
+        first = first[at]
+        strand = self.pair[index[first]] % self.strands
+        _, group = np.unique(self.frame[index[first]] * self.strands + strand, return_inverse=True)
+        contested = np.zeros(int(some[-1]) + 1, bool)
+        contested[some] = np.bincount(group)[group] > 1
+        return np.flatnonzero(contested[pair])
 
     def _winners(self, index: Int, mean: Array) -> Mask:
         """Of the feet ``index``, those whose detection is the likeliest at their place."""

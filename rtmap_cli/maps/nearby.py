@@ -8,6 +8,7 @@ it the foot on that stretch is a step or two along the line away.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,24 +43,41 @@ class Nearby:
     start: Int
     stop: Int
 
-    def candidates(self, points: Array) -> tuple[Int, Int]:
+    def feet(self, points: Array) -> tuple[Int, Int, Array, Array]:
         """Pairs of a point (index into (m, 2), ascending) and the station of a stretch near it that
-        is nearest along the line; a station may come twice."""
-        x, y = (np.floor(points[:, k] / CELL).astype(np.int64) - self.low[k] for k in (0, 1))
-        inside = np.flatnonzero((x >= 0) & (y >= 0) & (x < self.shape[0]) & (y < self.shape[1]))
-        row = self._rows(x[inside] * self.shape[1] + y[inside])
-        inside, row = inside[row >= 0], row[row >= 0]
-        count = self.first[row + 1] - self.first[row]
-        entry = np.repeat(self.first[row] - (np.cumsum(count) - count), count)
-        i, j = np.repeat(inside, count), self.station[entry + np.arange(len(entry))]
-        dx, dy = points[:, 0][i] - self.xy[:, 0][j], points[:, 1][i] - self.xy[:, 1][j]
-        along = dx * self.tangent[:, 0][j] + dy * self.tangent[:, 1][j]
-        step = np.rint(along / self.gap[j]).astype(np.int64)
-        return i, np.clip(j + step, self.start[j], self.stop[j])
+        is nearest along the line (a station may come twice), and how far (m) the point lies along
+        and to the left of the tangent of the station."""
+        px, py = np.ascontiguousarray(points.T)
+        column = np.floor(px / CELL).astype(np.int64) - self.low[0]
+        row = np.floor(py / CELL).astype(np.int64) - self.low[1]
+        inside = (column >= 0) & (row >= 0) & (column < self.shape[0]) & (row < self.shape[1])
+        row = self._rows(np.where(inside, column * self.shape[1] + row, -1))
+        i = np.flatnonzero(row >= 0)
+        row = row[i]
+        entry = self.first[row]
+        count = self.first[row + 1] - entry
+        if len(count) and count.max() > 1:
+            i = np.repeat(i, count)
+            entry = np.repeat(entry - (np.cumsum(count) - count), count) + np.arange(len(i))
+        j = self.station[entry]
+        sx, sy, tx, ty = self._columns
+        px, py = px[i], py[i]
+        step = (px - sx[j]) * tx[j] + (py - sy[j]) * ty[j]
+        moved = j + np.rint(step / self.gap[j]).astype(np.int64)
+        j = np.minimum(np.maximum(moved, self.start[j]), self.stop[j])
+        px -= sx[j]
+        py -= sy[j]
+        x, y = tx[j], ty[j]
+        return i, j, px * x + py * y, x * py - y * px
+
+    @cached_property
+    def _columns(self) -> Array:
+        """(4, n) places and tangents of the stations, each number in a row of its own."""
+        return np.ascontiguousarray(np.column_stack([self.xy, self.tangent]).T)
 
     def _rows(self, cell: Int) -> Int:
         if self.row is not None:
-            return self.row[cell].astype(np.int64)
+            return np.where(cell >= 0, self.row[cell], -1)
         at = np.minimum(np.searchsorted(self.cell, cell), len(self.cell) - 1)
         return np.where(self.cell[at] == cell, at, -1)
 

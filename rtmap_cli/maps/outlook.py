@@ -8,7 +8,7 @@ in view, by which frames, does this detection count) have one answer that fits t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -107,6 +107,7 @@ class Outlook:
     cell: NDArray[np.int32]
     distance: Single
     border: Single
+    sums: dict[Any, Array] = field(default_factory=dict, repr=False, compare=False)
 
     def cells(self, xy: Array) -> Int:
         """(n,) the drive's cell of places (n, 2), -1 outside its grid."""
@@ -122,10 +123,19 @@ class Outlook:
         """(n,) whether a frame could see a cell, ``margin`` (m) of its range left out."""
         return (cell >= 0) & (self.clear(frame, self._middles(cell), margin) >= 0)
 
+    def sees_in_turn(self, frame: Int, cell: Int, margin: float) -> Mask:
+        """``sees`` for places in a row, which often lie in the cell of the one before."""
+        new = np.ones(len(cell), bool)
+        new[1:] = (cell[1:] != cell[:-1]) | (frame[1:] != frame[:-1])
+        first = np.flatnonzero(new)
+        seen = self.sees(frame[first], cell[first], margin)
+        return np.repeat(seen, np.diff(first, append=len(cell)))
+
     def clear(self, frame: Int, xy: Array, margin: float) -> Array:
-        """(n,) distance (m) of places (n, 2) from a frame, -1 where it could not see them."""
+        """(...) distance (m) of places (..., 2) from a ``frame`` (of a shape that broadcasts), -1
+        where it could not see them."""
         c, s = np.cos(self.pose[:, 2])[frame], np.sin(self.pose[:, 2])[frame]
-        dx, dy = (xy[:, k] - self.pose[:, k][frame] for k in (0, 1))
+        dx, dy = (xy[..., k] - self.pose[:, k][frame] for k in (0, 1))
         x, y = c * dx + s * dy, c * dy - s * dx
         x0, y0, x1, y1 = self.range_m
         inside = (x >= x0 + margin) & (x <= x1 - margin) & (y >= y0 + margin) & (y <= y1 - margin)
@@ -136,6 +146,11 @@ class Outlook:
     def counted(self, margin: float, sight: SightModel | None = None) -> Array:
         """(cells + 1,) frames that could see each cell, or their summed detection probabilities by
         distance and border; 0 last, for places outside the grid."""
+        if (margin, sight) not in self.sums:
+            self.sums[margin, sight] = self._counted(margin, sight)
+        return self.sums[margin, sight]
+
+    def _counted(self, margin: float, sight: SightModel | None) -> Array:
         inside = self.border >= margin
         weight = None
         if sight is not None:

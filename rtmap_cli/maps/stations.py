@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.keys import numbered
 from rtmap_cli.geometry.polylines import arc_length, is_ring
 from rtmap_cli.maps.nearby import Nearby, nearby
 from rtmap_cli.maps.strands import strands_of
@@ -80,6 +81,12 @@ class Stations:
             self.grids[gate] = nearby(self.xy, self.tangent, self.s, self.line, reach)
         return self.grids[gate]
 
+    def same(self, other: Stations) -> bool:
+        """True for the same stations of the same lines."""
+        return self is other or (
+            np.array_equal(self.line, other.line) and np.array_equal(self.xy, other.xy)
+        )
+
     def of_line(self, k: int) -> Int:
         """Indices of the stations of line ``k`` in order (they lie together)."""
         a, b = np.searchsorted(self.line, [k, k + 1])
@@ -105,10 +112,15 @@ class Samples:
         return len(self.xy)
 
     @cached_property
+    def planar(self) -> Array:
+        """(3, n) xx, xy, yy of the covariances, each in a row of its own (m²)."""
+        return np.ascontiguousarray(self.covariance.reshape(-1, 4)[:, [0, 1, 3]].T)
+
+    @cached_property
     def across_sigma(self) -> Array:
         """(n,) standard deviation of each sample across its own detection, metres."""
         tx, ty = self.tangent.T
-        xx, xy, yy = (self.covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        xx, xy, yy = self.planar
         return np.asarray(np.sqrt(ty * ty * xx - 2 * tx * ty * xy + tx * tx * yy))
 
 
@@ -244,6 +256,18 @@ def _hairpins(xy: Array, step: Array) -> NDArray[np.bool_]:
 
     The two sides of a narrow island come in one detection, but are two lines.
     """
+    out = np.zeros(step.shape[:1] + (step.shape[1] + 1,), bool)
+    # Where every step is within 60° of the chord, no two parts differ by more than 120°.
+    chord = xy[:, -1] - xy[:, 0]
+    ahead = np.diff(xy[..., 0], axis=1) * chord[:, :1] + np.diff(xy[..., 1], axis=1) * chord[:, 1:]
+    bent = np.flatnonzero((ahead <= 0.5 * step * np.hypot(*chord.T)[:, None]).any(axis=1))
+    if len(bent):
+        out[bent] = _turns(xy[bent], step[bent])
+    return out
+
+
+def _turns(xy: Array, step: Array) -> NDArray[np.bool_]:
+    """``_hairpins`` of detections that do not run straight on."""
     n, k = xy.shape[:2]
     reach = np.clip(np.round(HAIRPIN / np.maximum(step.mean(axis=1), 1e-3)), 2, k // 3).astype(int)
     index, rows = np.arange(k), np.arange(n)[:, None]
@@ -269,14 +293,14 @@ def candidate_feet(
     """Best foot of each sample on each chain, or ``unit`` (n,) of stations, in reach: sample,
     station, offset, along."""
     unit = stations.chain if unit is None else unit
-    i, j = stations.near(gate).candidates(samples.xy)
-    tx, ty = stations.tangent[:, 0][j], stations.tangent[:, 1][j]
-    dx = samples.xy[:, 0][i] - stations.xy[:, 0][j]
-    dy = samples.xy[:, 1][i] - stations.xy[:, 1][j]
-    along, offset = dx * tx + dy * ty, tx * dy - ty * dx
-    aligned = np.abs(samples.tangent[:, 0][i] * tx + samples.tangent[:, 1][i] * ty) >= MIN_COS
-    ok = np.flatnonzero(aligned & (np.abs(offset) <= gate) & (np.abs(along) <= STEP))
-    i, j, along, offset = i[ok], j[ok], along[ok], offset[ok]
+    i, j, along, offset = stations.near(gate).feet(samples.xy)
+    ok = np.flatnonzero((np.abs(offset) <= gate) & (np.abs(along) <= STEP))
+    i, j = i[ok], j[ok]
+    tx, ty = stations.tangent.take(j, axis=0).T
+    sx, sy = samples.tangent.take(i, axis=0).T
+    aligned = np.flatnonzero(np.abs(sx * tx + sy * ty) >= MIN_COS)
+    i, j, ok = i[aligned], j[aligned], ok[aligned]
+    along, offset = along[ok], offset[ok]
     same = i[1:] == i[:-1]
     twice = np.flatnonzero(np.append(same, False) | np.insert(same, 0, False))
     if len(twice):
@@ -300,7 +324,7 @@ def assign(
     what that chain does not cover goes to the next one, for ``rounds`` rounds: a detection may
     run over several lines but no sample counts twice. The last answer is remembered.
     """
-    if samples.last and samples.last[0][0] is stations and samples.last[0][1:] == (gate, rounds):
+    if samples.last and samples.last[0][1:] == (gate, rounds) and stations.same(samples.last[0][0]):
         return samples.last[1]
     found = _assigned(stations, samples, gate, rounds)
     samples.last[:] = [(stations, gate, rounds), found]
@@ -316,30 +340,30 @@ def _assigned(
         return nothing, taken
     i, j, offset, along = candidate_feet(stations, samples, gate)
     chains = int(stations.chain.max()) + 1
-    keys, inverse = np.unique(
-        samples.detection[i] * chains + stations.chain[j], return_inverse=True
-    )
+    keys, inverse = numbered(samples.detection[i] * chains + stations.chain[j])
     owner = keys // chains
     spacing = samples.spacing[i]
     value = spacing * (gate - np.abs(offset))
     total = np.bincount(samples.detection, samples.spacing)
     least = np.minimum(MIN_STRETCH, 0.6 * total[owner])
     parts: list[Int] = []
+    left = np.arange(len(i))
     for _ in range(rounds):
-        free = np.flatnonzero(~taken[i])
-        if not len(free):
-            break
-        gain = np.bincount(inverse[free], value[free], len(keys))
-        cover = np.bincount(inverse[free], spacing[free], len(keys))
+        gain = np.bincount(inverse, value, len(keys))
+        cover = np.bincount(inverse, spacing, len(keys))
         enough = (cover >= least) & (cover > 0)
         order = np.lexsort((keys, -np.where(enough, gain, -1.0), owner))
         best = np.zeros(len(keys), bool)
         best[order] = np.concatenate([[True], owner[order][1:] != owner[order][:-1]])
-        index = free[(best & enough)[inverse[free]]]
-        if not len(index):
+        chosen = left[(best & enough)[inverse]]
+        if not len(chosen):
             break
-        parts.append(index)
-        taken[i[index]] = True
+        parts.append(chosen)
+        taken[i[chosen]] = True
+        free = np.flatnonzero(~taken[i[left]])
+        if not len(free):
+            break
+        left, inverse, value, spacing = left[free], inverse[free], value[free], spacing[free]
     if not parts:
         return nothing, taken
     k = np.concatenate(parts)

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.rings import align, open_rings, overlap, polygons
+from rtmap_cli.geometry.rings import align, open_rings, polygons
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.visibility import Views
 from rtmap_cli.steps.detect_changes.votes import (
@@ -35,6 +35,8 @@ VISIBLE = 0.65
 """A ring is in view of a frame when this share of its outline and middle is."""
 INSIDE = 0.6
 """A detection with this share of its area in a known ring is a piece of that ring."""
+COARSE = 4
+"""Every so many-th point of a ring is enough to tell how much two of them share."""
 FAR_LOSS = 0.25
 """Share of the detection probability that is lost at 36 m."""
 RING_MARGIN = 0.5
@@ -126,12 +128,14 @@ def match(rings: Rings, places: Array, first: int = 0) -> Int:
     near = near[near["v"] <= gate[near["i"]]]
     i, j = near["i"], near["j"]
     later = j >= first if first else np.zeros(len(j), bool)
-    taken: set[tuple[int, int]] = set()
-    for k in np.lexsort((j, i, near["v"], later)).tolist():
-        slot = (int(rings.frame[i[k]]), int(j[k]))
-        if out[i[k]] < 0 and slot not in taken:
-            out[i[k]] = j[k]
-            taken.add(slot)
+    order = np.lexsort((j, i, near["v"], later))
+    owner, taken = out.tolist(), set[tuple[int, int]]()
+    frame = rings.frame[i[order]].tolist()
+    for ring, place, at in zip(i[order].tolist(), j[order].tolist(), frame, strict=True):
+        if owner[ring] < 0 and (at, place) not in taken:
+            owner[ring] = place
+            taken.add((at, place))
+    out = np.array(owner, np.int64)
     for pieces in (_overlapping, _cut_places):
         left = np.flatnonzero(out < 0)
         if len(left):
@@ -151,8 +155,8 @@ def _overlapping(rings: Rings, rows: Int, gate: Array, places: Array) -> Int:
         return out
     some, one = np.unique(k, return_inverse=True)
     them, other = np.unique(j, return_inverse=True)
-    mine = polygons(rings.points[rows[some]])[one]
-    theirs = polygons(places[them])[other]
+    mine = polygons(rings.points[rows[some], ::COARSE])[one]
+    theirs = polygons(places[them, ::COARSE])[other]
     common, own, other = shapely.area(np.stack([shapely.intersection(mine, theirs), mine, theirs]))
     share = common / np.maximum(own + other - common, 1e-12)
     within = common / np.maximum(own, 1e-12)
@@ -299,12 +303,18 @@ def _mean(rings: Array, weight: Array) -> Array:
 def _apart(means: Array) -> Array:
     """Means without those that overlap an earlier (better supported) one by a third, or lie within
     ``NEAR`` of it: one crossing that a drive saw a little off must not compete with itself."""
-    shapes, places, boxes = polygons(means), features(means), _boxes(means)
+    shapes, places, boxes = polygons(means[:, ::COARSE]), features(means), _boxes(means)
+    area = shapely.area(shapes)
     keep: list[int] = []
-    for k, shape in enumerate(shapes):
-        far = (np.hypot.reduce(places[k] - places[keep], axis=1) > NEAR).all() if keep else True
-        near = np.array(keep, np.int64)[_boxes_meet(boxes[k : k + 1], boxes[keep])[0]]
-        if far and all(overlap(shape, shapes[j]) < 0.3 for j in near):
+    for k in range(len(means)):
+        others = np.array(keep, np.int64)
+        if (np.hypot(*(places[k] - places[others])[:, :2].T) <= NEAR).any() and (
+            np.hypot.reduce(places[k] - places[others], axis=1) <= NEAR
+        ).any():
+            continue
+        near = others[_boxes_meet(boxes[k : k + 1], boxes[others])[0]]
+        common = shapely.area(shapely.intersection(shapes[k], shapes[near]))
+        if (common < 0.3 * (area[k] + area[near] - common)).all():
             keep.append(k)
     return means[keep]
 
@@ -313,7 +323,7 @@ def _ring_views(places: Array, traversal: Traversal) -> tuple[Views, Array]:
     """Frames that could see each ring, and the weight of each view."""
     outline = places[:, :: max(places.shape[1] // 16, 1)]
     points = np.concatenate([outline, places.mean(axis=1, keepdims=True)], axis=1)
-    per, pose = points.shape[1], traversal.pose
+    pose = traversal.pose
     # Of a ring that is seen whole enough the middle is in the range, or nearly so.
     room = np.ptp(places, axis=1).max(axis=1, initial=0.0) / 2
     c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
@@ -322,9 +332,7 @@ def _ring_views(places: Array, traversal: Traversal) -> tuple[Views, Array]:
     x0, y0, x1, y1 = traversal.range_m
     near = (x >= x0 - room) & (x <= x1 + room) & (y >= y0 - room) & (y <= y1 + room)
     frame, ring = np.nonzero(near)
-    distance = traversal.outlook.clear(
-        np.repeat(frame, per), points[ring].reshape(-1, 2), RING_MARGIN
-    ).reshape(-1, per)
+    distance = traversal.outlook.clear(frame[:, None], points[ring], RING_MARGIN)
     seen = distance >= 0
     share = seen.mean(axis=1)
     ok = share >= VISIBLE

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.keys import numbered
 from rtmap_cli.geometry.polylines import is_ring
 from rtmap_cli.maps.existence import runs_of
 from rtmap_cli.maps.stations import Samples, Stations, assign, stations_of
@@ -109,7 +110,7 @@ def _counted(stations: Stations, place: Int, samples: Sequence[Samples]) -> _Bes
             continue
         cell = s.frame[feet.sample] * n + place[feet.station]
         count = int(s.detection.max()) + 1
-        keys, row = np.unique(cell * count + s.detection[feet.sample], return_inverse=True)
+        keys, row = numbered(cell * count + s.detection[feet.sample])
         offset = np.bincount(row, feet.offset) / np.bincount(row)
         # In order of frame and place; of each the first and the last in order of offset.
         cells = keys // count

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.logs.offsets import fused_offsets
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.assignment import assign_once
 from rtmap_cli.maps.refit import FusionModel, solve_vertices
@@ -15,7 +14,9 @@ from rtmap_cli.maps.sight import SightModel
 from rtmap_cli.maps.stations import (
     Samples,
     Stations,
+    assign,
     loose_stretches,
+    smoother,
     stations_of,
 )
 from rtmap_cli.steps.detect_changes.field import BLOCK, CELL, Marks, blocks
@@ -33,11 +34,16 @@ Int = NDArray[np.int64]
 
 SHORTEST = 3.0
 """Shorter pieces of detections (m) are not candidates for new lines."""
-BLUR = {"boundary": 1.0}
+BLUR = {"boundary": 1.25}
 """Blur of the field in median sigmas; classes without close parallels bear more."""
-USUAL_BLUR = 0.45
-HIGH, LOW = 0.20, 0.06
+USUAL_BLUR = 0.88
+WIDEST_BLUR = 1.2
+HIGH, LOW = 0.18, 0.054
 """Ridges start and end at these shares of the height that a steady line would have."""
+FINEST = 0.05
+"""No detection is sharper (m)."""
+THIN = 0.02
+"""Where so little of the usual weight is, nothing was seen."""
 JOIN_GAP = {"boundary": 12.0}
 USUAL_GAP, JOIN_ANGLE = 7.0, float(np.radians(25))
 """Ends of new lines that look at each other are joined over such a gap (m): boundaries go on."""
@@ -61,10 +67,9 @@ def new_lines(
     if not len(widths):
         return []
     median = float(np.median(widths))
-    blur = float(np.clip(BLUR.get(class_name, USUAL_BLUR) * median, CELL, 0.9))
-    spread = np.sqrt(2 * median**2 + blur**2)
+    blur = float(np.clip(BLUR.get(class_name, USUAL_BLUR) * median, CELL, WIDEST_BLUR))
     score = float(np.mean(np.concatenate([d.score for d in drives])))
-    steady = 0.5 * score / (np.sqrt(2 * np.pi) * spread)
+    steady = 0.5 * score / (np.sqrt(2 * np.pi) * np.hypot(median, blur)) / median
     points = _all_ridge_points(drives, traversals, blur, LOW * steady)
     if points is None:
         return []
@@ -95,11 +100,14 @@ def refit_lines(
     samples: Sequence[Samples],
     model: FusionModel,
 ) -> list[Array]:
-    """New lines moved to where their detections put them, ``others`` competing for detections."""
+    """New lines moved to where their detections put them, ``others`` competing for detections.
+
+    Before anything is judged the plain mean will do: fusion puts what remains to where it lies.
+    """
     if not lines:
         return []
     stations = stations_of([*others, *lines])
-    offset, variance = fused_offsets(stations, traversals, samples, model)
+    offset, variance = _mean_offsets(stations, traversals, samples, model)
     mine = stations.line >= len(others)
     start = np.tile(np.eye(2) * 1.0, (int(mine.sum()), 1, 1))
     moved, _ = solve_vertices(
@@ -110,6 +118,43 @@ def refit_lines(
     moved *= np.minimum(1.0, 1.0 / np.maximum(size, 1e-9))[:, None]
     xy = stations.xy[mine] + moved
     return [xy[stations.line[mine] == k + len(others)] for k in range(len(lines))]
+
+
+def _mean_offsets(
+    stations: Stations,
+    traversals: Sequence[Traversal],
+    samples: Sequence[Samples],
+    model: FusionModel,
+) -> tuple[Array, Array]:
+    """Offset (m, to the left) of the detections around every station and its variance (m²; NaN, inf
+    where there are none): a robust mean over the drives of each one's weighted mean."""
+    n, smooth = len(stations), smoother(stations, model.width)
+    offset, variance = np.full((2, len(samples), n), np.nan)
+    for k, (traversal, s) in enumerate(zip(traversals, samples, strict=True)):
+        feet, _ = assign(stations, s)
+        if not len(feet):
+            continue
+        sigma = np.maximum(s.across_sigma[feet.sample], FINEST)
+        weight = s.spacing[feet.sample] * np.maximum(s.score[feet.sample], 0.02) / sigma**3
+        sums = [
+            np.bincount(feet.station, v, n)
+            for v in (weight, weight * feet.offset, weight * sigma**2)
+        ]
+        total, moment, square = (smooth @ v for v in sums)
+        ok = total > THIN * np.median(total[total > 0])
+        pose = traversal.pose_covariance[:, [0, 1], [0, 1]].mean()
+        offset[k, ok] = moment[ok] / total[ok]
+        variance[k, ok] = square[ok] / total[ok] + pose
+    seen = np.isfinite(offset)
+    value, information = np.where(seen, offset, 0.0), np.where(seen, 1 / variance, 0.0)
+    weight = information
+    for _ in range(4):
+        mean = (weight * value).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
+        z = np.abs(value - mean) * np.sqrt(information)
+        weight = information * np.minimum(1.0, model.huber / np.maximum(z, 1e-9))
+    some = seen.any(axis=0)
+    total = np.where(some, weight.sum(axis=0), 1.0)
+    return np.where(some, mean, np.nan), np.where(some, 1 / total, np.inf)
 
 
 def all_line_counts(

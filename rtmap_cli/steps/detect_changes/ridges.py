@@ -60,16 +60,10 @@ def ridge_points(
 
     scale = max(blur / cell, 0.8)
     by_row = [gaussian_filter1d(field, scale, 0, k, mode="constant") for k in range(3)]
-
-    def derivative(y: int, x: int) -> Array:
-        out: Array = gaussian_filter1d(by_row[y], scale, 1, x, mode="constant")
-        return out
-
-    value = derivative(0, 0)
+    value = gaussian_filter1d(by_row[0], scale, 1, mode="constant")
+    # Few cells are that high: derivatives are worked out for these alone.
     rows, columns = np.nonzero(value >= low)
-    gx, gy = derivative(0, 1)[rows, columns], derivative(1, 0)[rows, columns]
-    xx, yy = derivative(0, 2)[rows, columns], derivative(2, 0)[rows, columns]
-    xy = derivative(1, 1)[rows, columns]
+    gx, gy, xx, xy, yy = _derivatives(by_row, rows, columns, scale)
     # Eigenvector of the most negative eigenvalue of [[xx, xy], [xy, yy]].
     half, mean = np.hypot((xx - yy) / 2, xy), (xx + yy) / 2
     curvature = mean - half
@@ -86,6 +80,27 @@ def ridge_points(
         value[rows, columns],
         index.astype(np.int64),
     )
+
+
+def _derivatives(by_row: list[Array], rows: Int, columns: Int, scale: float) -> list[Array]:
+    """d/dx, d/dy, d²/dx², d²/dxdy, d²/dy² at cells, of a field whose Gaussian derivatives across
+    the rows are ``by_row`` (orders 0, 1, 2); what lies beside the field is zero."""
+    from scipy.ndimage import gaussian_filter1d
+
+    reach = int(4 * scale + 0.5)
+    spike = np.zeros(2 * reach + 1)
+    spike[reach] = 1.0
+    kernels = [gaussian_filter1d(spike, scale, order=k, mode="constant")[::-1] for k in range(3)]
+    wanted = ((0, 1), (1, 0), (0, 2), (1, 1), (2, 0))
+    out = [np.zeros(len(rows)) for _ in wanted]
+    padded = [np.pad(part, ((0, 0), (reach, reach))) for part in by_row]
+    first = rows * padded[0].shape[1] + columns
+    for step in range(2 * reach + 1):
+        at = first + step
+        values = [part.ravel()[at] for part in padded]
+        for total, (y, x) in zip(out, wanted, strict=True):
+            total += kernels[x][step] * values[y]
+    return out
 
 
 def trace(points: RidgePoints, high: float, shortest: float) -> list[Array]:

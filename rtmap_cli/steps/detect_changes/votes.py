@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +28,8 @@ Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+TOGETHER = 3
+"""Feet of a detection that are so many stations apart, or nearer, cover those between them."""
 SEEN_SHARE = 0.3
 """A drive has seen a place when it found something in this share of the usual rate."""
 CONFIRMED = 0.35
@@ -83,6 +86,19 @@ class DriveCounts:
     hit_place: Int
     hit_frame: Int
     hit_score: Array
+
+    @cached_property
+    def _by_place(self) -> tuple[Int, Int]:
+        """The hits in order of their places, and where those of each place begin."""
+        first = np.concatenate([[0], np.cumsum(np.bincount(self.hit_place, None, len(self.hits)))])
+        return np.argsort(self.hit_place, kind="stable"), first
+
+    def hits_at(self, index: Int) -> Int:
+        """The hits at the places ``index``, in their order."""
+        order, first = self._by_place
+        count = first[index + 1] - first[index]
+        at = np.repeat(first[index] - (np.cumsum(count) - count), count) + np.arange(count.sum())
+        return np.sort(order[at])
 
 
 def detection_value(score: Array) -> Array:
@@ -181,27 +197,42 @@ def line_counts(
     n, outlook = len(stations), traversal.outlook
     cell = outlook.cells(stations.xy)
     views_ = outlook.counted(margin, sight)[cell] * sight.curve("to_end", stations.to_end)
-    keys, values, scores = [], [], []
-    frame, score = samples.frame[feet.sample], samples.score[feet.sample]
-    value = detection_value(score)
-    wide = samples.spacing[feet.sample] > STEP
-    for shift in (0, -1, 1):
-        place = np.clip(feet.station + shift, 0, n - 1)
-        ok = stations.line[place] == stations.line[feet.station]
-        # Detections with vertices far apart cover the stations between them, too.
-        ok &= wide | (shift == 0) | (np.sign(feet.along) == shift)
-        keys.append((frame * n + place)[ok])
-        values.append(value[ok])
-        scores.append(score[ok])
+    key, score = _covered(stations, samples, feet)
     asked_key, existence = _asked_stations(stations, ids, traversal)
-    keys.append(asked_key)
-    values.append(answer_value(existence))
-    scores.append(existence)
-    key, value, score = _best_hits(*map(np.concatenate, (keys, values, scores)))
+    value = np.concatenate([detection_value(score), answer_value(existence)])
+    key, value, score = _best_hits(
+        np.concatenate([key, asked_key]), value, np.concatenate([score, existence])
+    )
     at, place = np.divmod(key, n)
-    ok = outlook.sees(at, cell[place], margin)
+    ok = outlook.sees_in_turn(at, cell[place], margin)
     looked = CellLooks(outlook, cell, margin)
     return _counted(n, looked, views_, key[ok], value[ok], score[ok])
+
+
+def _covered(stations: Stations, samples: Samples, feet: Feet) -> tuple[Int, Array]:
+    """Frame · n + station of all stations that detections cover, and the scores of these.
+
+    What a detection covers of a line is a stretch from its first to its last foot. Detections
+    with vertices far apart cover the stations beside these, too.
+    """
+    n = len(stations)
+    if not len(feet):
+        return np.zeros(0, np.int64), np.zeros(0)
+    station, line = feet.station, stations.line[feet.station]
+    detection = samples.detection[feet.sample]
+    change = np.ones(len(feet), bool)
+    change[1:] = (detection[1:] != detection[:-1]) | (line[1:] != line[:-1])
+    change[1:] |= np.abs(np.diff(station)) > TOGETHER
+    start = np.flatnonzero(change)
+    wide = samples.spacing[feet.sample] > STEP
+    low = np.minimum.reduceat(station - (wide | (feet.along < 0)), start)
+    high = np.maximum.reduceat(station + (wide | (feet.along > 0)), start)
+    bounds = np.searchsorted(stations.line, [line[start], line[start] + 1])
+    low, high = np.maximum(low, bounds[0]), np.minimum(high, bounds[1] - 1)
+    count = high - low + 1
+    first = feet.sample[start]
+    key = np.repeat(samples.frame[first] * n + low - (np.cumsum(count) - count), count)
+    return key + np.arange(len(key)), np.repeat(samples.score[first], count)
 
 
 def _asked_stations(
@@ -281,9 +312,7 @@ class Ballot:
         drive, time = self.drives[k], self.times[k]
         if not drive.views[index].any():
             return None
-        mine = np.zeros(self.votes.shape[-1], bool)
-        mine[index] = True
-        found = mine[drive.hit_place]
+        found = drive.hits_at(index)
         view_frames = _mostly(drive.looks.frames(index), len(time))
         hit_frames = np.flatnonzero(_mostly(drive.hit_frame[found], len(time)) & view_frames)
         score = drive.hit_score[found]
