@@ -1,8 +1,7 @@
 """The density field of what the prior does not explain: where many drives saw a line.
 
-Per drive Σ score / σ over the places along its detections, divided by the number of frames that
-could see the cell; then the mean over the drives that looked: one vote per drive. The field is a
-histogram; what looks for ridges in it blurs it (``ridges``), by what a detection is usually off.
+Per drive Σ score · N(distance across the line; σ) over its detections, divided by the number of
+frames that could see the cell; then the mean over the drives that looked: one vote per drive.
 """
 
 from __future__ import annotations
@@ -46,37 +45,52 @@ class Marks:
         return Marks(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
-SHARPEST, WIDEST = 0.2, 1.2
-"""Sigmas (m) beyond these are taken as these."""
-PART = 16384
+BELL = np.linspace(-2.4, 2.4, 17)
+"""Where the bell across a line is laid down, in sigmas: with steps below a sigma its sum is that
+of the bell to a millionth."""
+APART = 1
+"""Samples are laid down about so many cells apart along their lines."""
+WIDEST = 1.2
+"""Larger sigmas (m) are taken as that: wider bells say nothing and cost most."""
+PAD = 34
+"""Cells around a field that bells of samples in it, or just beside it, may reach."""
+PART = 4096
 """Samples that are laid down together: what they need stays in the processor's cache."""
 
 
 def deposits(marks: Marks, start: Int, width: int, height: int) -> Array:
-    """Line samples, score / sigma per metre of line, summed by cell: (rows y, columns x), 1/m².
+    """Line samples, each N(0, sigma²) across its line, summed by cell: (rows y, columns x).
 
-    Samples are repeated along their tangents, a cell apart. A sharp detection is as high as its
-    bell across the line would be, whatever blur follows.
+    Samples farther apart than `APART` cells are repeated along their tangents.
     """
-    repeat = np.maximum(np.ceil(marks.spacing / CELL), 1).astype(np.int64)
-    share = marks.score / np.clip(marks.sigma, SHARPEST, WIDEST) * marks.spacing / repeat
+    spacing, tangent = marks.spacing, marks.tangent / CELL
+    repeat = np.maximum(np.ceil(spacing / (APART * CELL)), 1).astype(np.int64)
+    row = np.repeat(np.arange(len(spacing)), repeat)
+    k = np.arange(len(row)) - np.repeat(np.cumsum(repeat) - repeat, repeat)
+    shift = ((k + 0.5) / repeat[row] - 0.5) * spacing[row]
+    x = marks.xy[row, 0] / CELL + shift * tangent[row, 0] - start[0]
+    y = marks.xy[row, 1] / CELL + shift * tangent[row, 1] - start[1]
+    side = PAD / 2
+    near = (x > -side) & (y > -side) & (x < width + side) & (y < height + side)
+    row = row[near]
     # Single precision places a sample to a thousandth of a cell, in half the memory.
-    step = (marks.tangent * (marks.spacing / repeat / CELL)[:, None]).astype(np.float32)
-    first = (marks.xy / CELL - start).astype(np.float32)
-    first -= step * ((repeat - 1) / 2).astype(np.float32)[:, None]
-    # Around the field a border for those that lie beside it.
-    columns = width + 2
-    out = np.zeros((height + 2) * columns)
-    for count in np.unique(repeat).tolist():
-        own = np.flatnonzero(repeat == count)
-        along = np.arange(count, dtype=np.float32)
-        for n in range(0, len(own), max(PART // count, 1)):
-            k = own[n : n + max(PART // count, 1)]
-            x, y = (first[k, i, None] + step[k, i, None] * along + np.float32(1) for i in (0, 1))
-            x, y = np.clip(x, 0, width + 1), np.clip(y, 0, height + 1)
-            cell = y.astype(np.int64) * columns + x.astype(np.int64)
-            np.add.at(out, cell.ravel(), np.repeat(share[k], count))
-    return out.reshape(height + 2, columns)[1:-1, 1:-1] / CELL**2
+    x, y = (x[near] + PAD).astype(np.float32), (y[near] + PAD).astype(np.float32)
+    sigma = np.clip(marks.sigma, CELL, WIDEST)
+    ax = (-sigma * tangent[:, 1]).astype(np.float32)[row]
+    ay = (sigma * tangent[:, 0]).astype(np.float32)[row]
+    share = (marks.score * spacing / repeat)[row]
+    bell = np.exp(-0.5 * BELL**2)
+    bell /= bell.sum() * CELL**2
+    u = BELL.astype(np.float32)[:, None]
+    columns, rows = width + 2 * PAD, height + 2 * PAD
+    out = np.zeros(rows * columns)
+    for first in range(0, len(row), PART):
+        z = slice(first, first + PART)
+        # What is not negative is cut off as floor does.
+        cx, cy = (x[z] + u * ax[z]).astype(np.int32), (y[z] + u * ay[z]).astype(np.int32)
+        index = (cy * np.int32(columns) + cx).astype(np.intp)
+        np.add.at(out, index.ravel(), (bell[:, None] * share[z]).ravel())
+    return out.reshape(rows, columns)[PAD : PAD + height, PAD : PAD + width]
 
 
 def blocks(
@@ -84,7 +98,8 @@ def blocks(
 ) -> Iterator[tuple[Int, Int, Array]]:
     """Yield block, first cell and field of every block near samples; the field has a margin.
 
-    The field is in hits per view, by metre across the line and by metre of sigma.
+    The field is in hits per view and metre: a line that every frame sees with score 1 and
+    negligible σ would be infinitely high, with σ it is 1 / (√(2π) σ).
     """
     side, room = BLOCK * CELL, MARGIN * CELL
     looked = [t.outlook.counted(VIEW_MARGIN) for t in traversals]

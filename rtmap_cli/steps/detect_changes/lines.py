@@ -34,11 +34,10 @@ Int = NDArray[np.int64]
 
 SHORTEST = 3.0
 """Shorter pieces of detections (m) are not candidates for new lines."""
-BLUR = {"boundary": 1.25}
+BLUR = {"boundary": 1.0}
 """Blur of the field in median sigmas; classes without close parallels bear more."""
-USUAL_BLUR = 0.88
-WIDEST_BLUR = 1.2
-HIGH, LOW = 0.18, 0.054
+USUAL_BLUR = 0.45
+HIGH, LOW = 0.20, 0.06
 """Ridges start and end at these shares of the height that a steady line would have."""
 FINEST = 0.05
 """No detection is sharper (m)."""
@@ -67,9 +66,10 @@ def new_lines(
     if not len(widths):
         return []
     median = float(np.median(widths))
-    blur = float(np.clip(BLUR.get(class_name, USUAL_BLUR) * median, CELL, WIDEST_BLUR))
+    blur = float(np.clip(BLUR.get(class_name, USUAL_BLUR) * median, CELL, 0.9))
+    spread = np.sqrt(2 * median**2 + blur**2)
     score = float(np.mean(np.concatenate([d.score for d in drives])))
-    steady = 0.5 * score / (np.sqrt(2 * np.pi) * np.hypot(median, blur)) / median
+    steady = 0.5 * score / (np.sqrt(2 * np.pi) * spread)
     points = _all_ridge_points(drives, traversals, blur, LOW * steady)
     if points is None:
         return []
