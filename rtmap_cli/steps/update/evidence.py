@@ -21,6 +21,7 @@ from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.element import RING_CLASSES, Element
 from rtmap_cli.maps.evidence import Counts, DriveEvidence
 from rtmap_cli.maps.visibility import views
+from rtmap_cli.steps.update.claims import Drive
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -56,7 +57,7 @@ class Detected:
     traversal: Traversal
     tree: Any
     xy: Array
-    row: Int
+    score: Array
 
     @staticmethod
     def of(traversal: Traversal, class_name: str) -> Detected:
@@ -68,24 +69,34 @@ class Detected:
             which, xy = np.arange(len(mine)), traversal.points[mine][:, :-1].mean(axis=1)
         else:
             which, xy, _ = points_along(traversal.points[mine], NEAR)
-        xy, frame = xy.reshape(-1, 2), traversal.frame[mine[which]]
-        return Detected(traversal, cKDTree(_lifted(xy, frame)), xy, mine[which])
+        xy, row = xy.reshape(-1, 2), mine[which]
+        tree = cKDTree(_lifted(xy, traversal.frame[row]))
+        return Detected(traversal, tree, xy, traversal.score[row])
+
+    @staticmethod
+    def of_samples(drive: Drive, index: Int) -> Detected:
+        """Some of the samples of a drive."""
+        from scipy.spatial import cKDTree
+
+        s = drive.samples
+        xy = s.xy[index]
+        return Detected(drive.traversal, cKDTree(_lifted(xy, s.frame[index])), xy, s.score[index])
 
     def found(
         self, xy: Array, frame: Int, near: float, rivals: Any = None
     ) -> tuple[NDArray[np.bool_], Int]:
         """Whether some detection of its frame lies within ``near`` metres of each point (n, 2), and
-        its row; one that lies nearer to a line of ``rivals`` (shapely) is that line's."""
-        if not len(self.row):
+        its number; one that lies nearer to a line of ``rivals`` (shapely) is that line's."""
+        if not len(self.xy):
             return np.zeros(len(xy), bool), np.zeros(len(xy), np.int64)
         far, at = self.tree.query(_lifted(xy, frame), distance_upper_bound=near)
-        hit, at = np.isfinite(far), np.minimum(at, len(self.row) - 1)
+        hit, at = np.isfinite(far), np.minimum(at, len(self.xy) - 1)
         if rivals is not None and hit.any():
             import shapely
 
             other = shapely.distance(shapely.points(self.xy[at[hit]]), rivals)
             hit[hit] = far[hit] <= other
-        return hit, self.row[at]
+        return hit, np.asarray(at, np.int64)
 
 
 def _lifted(xy: Array, frame: Int) -> Array:
@@ -122,12 +133,12 @@ def seen_of(
         pairs = views(places, t.pose, t.range_m, t.occluders, margin)
         count = np.bincount(pairs.frame, minlength=len(t.pose))
         near = RING_NEAR if ring else NEAR
-        hit, row = d.found(places[pairs.point], pairs.frame, near, rivals)
+        hit, at = d.found(places[pairs.point], pairs.frame, near, rivals)
         hits = np.bincount(pairs.frame, hit, len(t.pose))
         looked = np.flatnonzero(count >= max(min(HALF * len(places), ENOUGH), 1))
         found = hits[looked] >= HALF * count[looked]
         used = hit & np.isin(pairs.frame, looked[found])
-        score = float(t.score[row[used]].mean()) if used.any() else None
+        score = float(d.score[at[used]].mean()) if used.any() else None
         times = t.timestamp_ns[looked]
         out.append(Seen(t.run_id, times, found, score, int(t.timestamp_ns[0])))
     return out
@@ -153,7 +164,6 @@ def aside_rate(
     class_name: str,
     drives: Sequence[Detected],
     margin: float,
-    rivals: Any,
 ) -> float:
     """How often frames find a line where there is none but one beside it: the tails of its errors,
     measured ``ASIDE`` metres to both sides of lines of the map."""
@@ -161,7 +171,7 @@ def aside_rate(
     for e in elements[:: max(1, len(elements) // SAMPLE)]:
         places = resample_step(e.xy, STEP)
         for side in (ASIDE, -ASIDE):
-            for s in seen_of(places + side * normals(places), class_name, drives, margin, rivals):
+            for s in seen_of(places + side * normals(places), class_name, drives, margin):
                 found, looks = found + int(s.found.sum()), looks + len(s.times)
     return float(np.clip(found / max(looks, 1), FALSE_RATE, 0.3))
 

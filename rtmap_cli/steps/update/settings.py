@@ -43,5 +43,5 @@ class Settings:
     simplify_m: float = 0.1
     gate_m: float = 1.5
     same_m: float = 0.8
-    lost: float = 0.15
+    lost: float = 0.25
     drives: int = 2
