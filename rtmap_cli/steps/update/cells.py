@@ -34,7 +34,7 @@ OBSERVED = 0.25
 """Share of a cell that some drive must have looked at."""
 LEAST = 1.0
 """Metres of a stretch in a cell that make it a reason."""
-PLENTY = 3.0
+PLENTY = 2.0
 """Metres of a stretch that are a reason whatever the precision is."""
 PIECE = 0.5
 """Shorter pieces (m) that a cell cuts off are none."""

@@ -43,8 +43,9 @@ THERE = 0.05
 """Stations of more confidence say what is usual."""
 LOOSE = 3.0
 """Shorter rests (m) of a detection are its ragged ends, not a line."""
-COMMON = 0.5
-"""An outline that has so much of the smaller area in common with an old one is that one's."""
+COMMON, CENTRES = 0.5, 3.0
+"""An outline that touches an old one is that one's if it has so much of the smaller area in common
+with it, or if their centres lie so near (m)."""
 FELT = 0.1
 """Share of looks that must have found a place before a drive says how far aside it lies."""
 
@@ -88,7 +89,9 @@ def loose_rings(traversal: Traversal, class_name: str, old: Sequence[Element]) -
     there = np.array(known)[j]
     common = shapely.area(shapely.intersection(seen[i], there))
     least = np.minimum(shapely.area(seen[i]), shapely.area(there))
-    return np.setdiff1d(mine, mine[i[common >= COMMON * np.maximum(least, 1e-9)]])
+    own = common >= COMMON * np.maximum(least, 1e-9)
+    own |= shapely.distance(shapely.centroid(seen[i]), shapely.centroid(there)) <= CENTRES
+    return np.setdiff1d(mine, mine[i[own]])
 
 
 @dataclass

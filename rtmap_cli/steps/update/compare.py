@@ -251,7 +251,7 @@ def _rings(
         if float(seen.mean()) < max(settings.lost, 0.25) * usual:
             out.append(Stretch(MISSING_NEW, name, e.element_id, e.xy))
     for j, line in enumerate(new):
-        if j in taken or line.confidence < 1.5 * settings.threshold * usual:
+        if j in taken or line.confidence < settings.threshold * usual:
             continue
         if line.drives >= BEHIND * need:
             out.append(Stretch(MISSING_OLD, name, None, line.points, line.confidence, line.drives))

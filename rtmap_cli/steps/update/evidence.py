@@ -60,11 +60,12 @@ class Detected:
     score: Array
 
     @staticmethod
-    def of(traversal: Traversal, class_name: str) -> Detected:
-        """Points along the lines of a class, or the middles of its outlines."""
+    def of(traversal: Traversal, class_name: str, chosen: Int | None = None) -> Detected:
+        """Points along the lines of a class, or the middles of its outlines; of all detections or
+        of the ``chosen`` rows."""
         from scipy.spatial import cKDTree
 
-        mine = np.flatnonzero(traversal.class_name == class_name)
+        mine = np.flatnonzero(traversal.class_name == class_name) if chosen is None else chosen
         if class_name in RING_CLASSES:
             which, xy = np.arange(len(mine)), traversal.points[mine][:, :-1].mean(axis=1)
         else:

@@ -104,7 +104,7 @@ def _judged(
     out = []
     for name in dict.fromkeys(s.class_name for s in stretches):
         mine = [s for s in stretches if s.class_name == name]
-        witness = Witnesses.of(traversals, old.of_class(name), name, claims.get(name), settings)
+        witness = Witnesses(traversals, old.of_class(name), name, claims.get(name), settings)
         for s in mine:
             counts, votes = witness.say(s)
             event = _event(s, counts, votes)

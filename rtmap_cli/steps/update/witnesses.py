@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.element import Element
 from rtmap_cli.maps.evidence import Counts
-from rtmap_cli.steps.update.claims import Claims
-from rtmap_cli.steps.update.compare import MISSING_NEW, MISSING_OLD, Stretch
+from rtmap_cli.steps.update.claims import Claims, loose_rings
+from rtmap_cli.steps.update.compare import MISSING_OLD, MOVED, Stretch
 from rtmap_cli.steps.update.evidence import (
     Detected,
     Rates,
@@ -34,25 +34,14 @@ BESIDE = 2.5
 
 @dataclass(frozen=True)
 class Witnesses:
-    """Drives and the ``old`` elements of a class, with the ``claims`` of these if they are lines.
-    """
+    """Drives and the ``old`` elements of a class, with the ``claims`` of these if they are lines
+    (None: they are outlines, or there are none)."""
 
     traversals: Sequence[Traversal]
     old: Sequence[Element]
     name: str
     claims: Claims | None
     settings: Settings
-
-    @staticmethod
-    def of(
-        traversals: Sequence[Traversal],
-        old: Sequence[Element],
-        name: str,
-        claims: Claims | None,
-        settings: Settings,
-    ) -> Witnesses:
-        """The witnesses of a class."""
-        return Witnesses(traversals, old, name, claims, settings)
 
     @cached_property
     def everything(self) -> list[Detected]:
@@ -63,26 +52,28 @@ class Witnesses:
 
     @cached_property
     def loose(self) -> list[Detected]:
-        """What no old line claims."""
-        if self.claims is None:
+        """What no old element claims."""
+        if self.claims is not None:
+            return [Detected.of_samples(d, d.loose) for d in self.claims.drives]
+        if not self.old:
             return self.everything
-        return [Detected.of_samples(d, d.loose) for d in self.claims.drives]
+        rings = [loose_rings(t, self.name, self.old) for t in self.traversals]
+        pairs = zip(self.traversals, rings, strict=True)
+        return [Detected.of(t, self.name, rows) for t, rows in pairs]
 
     @cached_property
     def alone(self) -> Rates:
-        """Of lines that have none beside them."""
+        """Of elements that have none beside them."""
         return Rates(usual_rate(self.old, self.name, self.everything, self.settings.margin_m))
 
     @cached_property
     def beside(self) -> Rates:
         """Of new lines beside old ones, which leave something there now and then."""
-        if self.claims is None:
-            return self.alone
         false = aside_rate(self.old, self.name, self.loose, self.settings.margin_m)
         return Rates(max(self.alone.usual, 1.5 * false), false)
 
     @cached_property
-    def kept(self) -> object:
+    def kept(self) -> Any:
         """The old lines as one geometry."""
         import shapely
 
@@ -93,24 +84,27 @@ class Witnesses:
         import shapely
 
         drives, rates, rivals = self.everything, self.alone, None
-        if self.claims is not None:
-            number = [e.element_id for e in self.old].index(stretch.element_id) if (
-                stretch.element_id is not None
-            ) else -1
-            if stretch.reason == MISSING_OLD:
-                drives = self.loose
+        if stretch.reason == MISSING_OLD:
+            drives = self.loose
+            if self.claims is not None:
                 near = shapely.distance(shapely.LineString(stretch.points), self.kept) < BESIDE
                 rates = self.beside if near else self.alone
-            else:
-                parts = [d.of_line(self.claims.stations, number) for d in self.claims.drives]
-                if stretch.reason != MISSING_NEW:
-                    # What is nearer to where it lay does not say that it moved.
-                    rivals = shapely.LineString(stretch.before)
-                    pairs = zip(parts, self.claims.drives, strict=True)
-                    parts = [np.union1d(p, d.loose) for p, d in pairs]
-                drives = [
-                    Detected.of_samples(d, p)
-                    for d, p in zip(self.claims.drives, parts, strict=True)
-                ]
-        seen = seen_of(stretch.points, self.name, drives, self.settings.margin_m, rivals)
-        return counts_of(seen, rates)
+        elif self.claims is not None:
+            drives = self._of_line(stretch)
+            if stretch.reason == MOVED:
+                # What is nearer to where it lay does not say that it moved.
+                rivals = shapely.LineString(stretch.before)
+        margin = self.settings.margin_m
+        return counts_of(seen_of(stretch.points, self.name, drives, margin, rivals), rates)
+
+    def _of_line(self, stretch: Stretch) -> list[Detected]:
+        """What the old line of a stretch claims, of a moved one also what nobody does."""
+        assert self.claims is not None
+        number = next(k for k, e in enumerate(self.old) if e.element_id == stretch.element_id)
+        out = []
+        for drive in self.claims.drives:
+            mine = drive.of_line(self.claims.stations, number)
+            if stretch.reason == MOVED:
+                mine = np.union1d(mine, drive.loose)
+            out.append(Detected.of_samples(drive, mine))
+        return out
