@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.blocks import Float
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.assignment import FLOOR, assign_once
 from rtmap_cli.maps.element import Element
@@ -109,7 +111,7 @@ class Claims:
     drives: list[Drive] = field(default_factory=list)
     sides: list[Array] = field(default_factory=list)
     variances: list[Array] = field(default_factory=list)
-    window: object = None
+    window: Any = None
 
     @staticmethod
     def empty(old: Sequence[Element]) -> Claims:
@@ -118,7 +120,7 @@ class Claims:
         window = smoother(stations, ALONG) if len(stations) else None
         return Claims(stations, np.zeros(len(stations)), np.zeros(len(stations)), window=window)
 
-    def add(self, drive: Drive, weight: Array, looks: Array) -> None:
+    def add(self, drive: Drive, weight: Array, looks: Array | Float) -> None:
         """One drive: ``weight`` (samples,) clarity · score of each, ``looks`` (n,) the weighted
         frames that had each station in view (inf: it did not look)."""
         self.drives.append(drive)
@@ -140,9 +142,9 @@ class Claims:
         for parts, values in ((self.sides, aside), (self.variances, stated)):
             parts.append(np.where(felt, values / np.maximum(total, 1e-9), np.nan))
 
-    def along(self, values: Array) -> Array:
+    def along(self, values: Any) -> Array:
         """(n,) values summed in a window along the lines."""
-        return np.asarray(self.window @ values, np.float64)  # type: ignore[operator]
+        return np.asarray(self.window @ values, np.float64)
 
     @property
     def confidence(self) -> Array:
@@ -157,10 +159,10 @@ class Claims:
         there = value[value > THERE]
         return float(np.median(there)) if len(there) else 0.0
 
-    def aside(self, agreed: int) -> tuple[Array, Array]:
-        """(n,) how far (m) to the left of its place a line lies, beyond what its neighbours do: the
-        median over the drives; NaN where fewer than ``agreed`` felt it. And the standard deviation
-        (n,) of that, up to a factor that is the same for the class."""
+    def aside(self, agreed: int) -> tuple[Array, Array, Array]:
+        """(n,) how far (m) to the left of its place a line lies, the median over the drives (NaN
+        where fewer than ``agreed`` felt it); the same beyond what its neighbours do; and the
+        standard deviation (n,) of these, up to a factor that is the same for the class."""
         n = len(self.stations)
         out, sigma = np.full(n, np.nan), np.full(n, np.nan)
         sides, variances = (np.array(v).reshape(-1, n) for v in (self.sides, self.variances))
@@ -169,7 +171,7 @@ class Claims:
         out[some] = np.nanmedian(sides[:, some], axis=0)
         shared = PLACE + (1 - PLACE) / felt[some]
         sigma[some] = np.sqrt(np.nanmean(variances[:, some], axis=0) * shared + FLOOR**2)
-        return out - self._around(out), sigma
+        return out, out - self._around(out), sigma
 
     def _around(self, offset: Array) -> Array:
         """(n,) the mean offset of other lines that run along within some metres, towards zero where

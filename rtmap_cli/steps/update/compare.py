@@ -147,11 +147,11 @@ def _moved(
 ) -> list[Stretch]:
     """Stretches that lie aside by more than offsets of the class usually are."""
     a = claims.stations
-    offset, sigma = claims.aside(need)
-    sigmas = np.abs(offset) / sigma
-    felt = sigmas[np.isfinite(sigmas)]
-    usual = 1.4826 * float(np.median(felt)) if len(felt) else 1.0
-    limit = np.maximum(MOVE, MOVE_SIGMAS * usual * sigma)
+    # A line lies aside of its neighbours; where all lanes have moved, of its place.
+    *ways, sigma = claims.aside(need)
+    limits = [np.maximum(MOVE, MOVE_SIGMAS * _usual(np.abs(w) / sigma) * sigma) for w in ways]
+    alone = np.abs(ways[1]) / limits[1] >= np.abs(ways[0]) / limits[0]
+    offset, limit = np.where(alone, ways[1], ways[0]), np.where(alone, limits[1], limits[0])
     out = []
     for k, e in enumerate(old):
         for side in (1.0, -1.0):
@@ -162,6 +162,12 @@ def _moved(
                 sure = float(claims.confidence[run].mean())
                 out.append(Stretch(MOVED, name, e.element_id, points, sure, need, a.xy[run]))
     return out
+
+
+def _usual(sigmas: Array) -> float:
+    """The factor that the sigmas of a class are off by, robustly."""
+    felt = sigmas[np.isfinite(sigmas)]
+    return 1.4826 * float(np.median(felt)) if len(felt) else 1.0
 
 
 def _beside(fresh: list[Stretch], moved: Sequence[Stretch]) -> list[Stretch]:

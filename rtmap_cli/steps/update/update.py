@@ -18,6 +18,7 @@ from rtmap_cli.maps.evidence import Counts
 from rtmap_cli.maps.existence import probability
 from rtmap_cli.steps.update.accumulate import Heat, accumulate, layout_of
 from rtmap_cli.steps.update.cells import Cell, Judge, flagged_stretches, judge_cells
+from rtmap_cli.steps.update.claims import Claims
 from rtmap_cli.steps.update.compare import (
     MISSING_NEW,
     MISSING_OLD,
@@ -26,7 +27,6 @@ from rtmap_cli.steps.update.compare import (
     compare,
     usual_of,
 )
-from rtmap_cli.steps.update.claims import Claims
 from rtmap_cli.steps.update.outlines import Line
 from rtmap_cli.steps.update.settings import Settings
 from rtmap_cli.steps.update.vectorise import usual_confidence, vectorise

@@ -7,7 +7,7 @@ beside another one is judged by its own detections. Outlines are judged by all d
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -30,6 +30,10 @@ from rtmap_cli.steps.update.settings import Settings
 
 BESIDE = 2.5
 """What is new so near (m) to a line of its class may be that line's errors."""
+
+CLUTTER = 0.07
+"""Share of the candidates for new lines that are something else, taken for a line at times: as
+many as lines are worn, so that what is found rarely stays undecided."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ class Witnesses:
             drives = self.loose
             if self.claims is not None:
                 near = shapely.distance(shapely.LineString(stretch.points), self.kept) < BESIDE
-                rates = self.beside if near else self.alone
+                rates = replace(self.beside if near else self.alone, clutter=CLUTTER)
         elif self.claims is not None:
             drives = self._of_line(stretch)
             if stretch.reason == MOVED:
@@ -106,5 +110,5 @@ class Witnesses:
             mine = drive.of_line(self.claims.stations, number)
             if stretch.reason == MOVED:
                 mine = np.union1d(mine, drive.loose)
-            out.append(Detected.of_samples(drive, mine))
+            out.append(Detected.of_samples(drive, mine, stretch.reason == MOVED))
         return out
