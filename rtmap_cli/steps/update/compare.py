@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import length
 from rtmap_cli.maps.element import RING_CLASSES, Element
-from rtmap_cli.maps.stations import Stations, stations_of
+from rtmap_cli.maps.stations import MIN_COS, Stations, stations_of
 from rtmap_cli.steps.update.accumulate import Accumulated, Heat
 from rtmap_cli.steps.update.claims import Claims
 from rtmap_cli.steps.update.outlines import Line
@@ -40,6 +40,10 @@ MOVE = 0.45
 """Lines that lie nearer (m) than this to their place in the map have not moved, however exact."""
 MOVE_SIGMAS = 4.0
 """Offsets count from so many usual ones (of the class, robustly measured) on."""
+GAUSSIAN = {0.3: 0.385, 0.5: 0.674}
+"""Quantiles of the absolute value of a unit Gaussian."""
+MOST = 1.25
+"""Offsets of whole places are hardly more often than that factor beyond the stated sigmas."""
 MOVE_LENGTH = 8.0
 SAME = 1.0
 """A new line so near (m) to a moved one is that one."""
@@ -134,24 +138,51 @@ def _lines(
     a = claims.stations
     looked, share = claims.looked >= need, claims.confidence / max(claims.usual, 1e-9)
     lost, poor = looked & (share < settings.lost), looked & (share < POOR * settings.lost)
+    offset, limit = _offsets(claims, need)
+    far = _to_fresh(a, fresh)
+    gone = lost & np.isfinite(far)
+    offset, limit = np.where(gone, far, offset), np.where(gone, MOVE, limit)
+    moved = _moved(name, old, claims, offset, limit, need)
+    lost, poor = lost & ~gone, poor & ~gone
     out = []
     for k, e in enumerate(old):
         for run in _runs(lost, poor, a.of_line(k), settings.shortest_m, a):
             out.append(Stretch(MISSING_NEW, name, e.element_id, a.xy[run]))
-    moved = _moved(name, old, claims, need, settings)
-    return _paired(out + _beside(fresh, moved)) + moved
+    return out + _beside(fresh, moved) + moved
+
+
+def _offsets(claims: Claims, need: int) -> tuple[Array, Array]:
+    """(n,) how far aside (m) stations of the old lines lie, and from where on they have moved: a
+    line lies aside of its neighbours or, where all lanes have moved, of its own place."""
+    place, beyond, sigma = claims.aside(need)
+    usual = _usual(np.abs(beyond) / sigma)
+    # Sigmas are not off by much more than that, or lines have moved all over the place.
+    wide = min(_usual(np.abs(place) / sigma), max(MOST, usual))
+    limits = [np.maximum(MOVE, MOVE_SIGMAS * f * sigma) for f in (wide, usual)]
+    alone = np.abs(beyond) / limits[1] >= np.abs(place) / limits[0]
+    return np.where(alone, beyond, place), np.where(alone, limits[1], limits[0])
+
+
+def _to_fresh(a: Stations, fresh: Sequence[Stretch]) -> Array:
+    """(n,) how far to the left (m) of old stations a new line runs along; NaN: none near."""
+    out = np.full(len(a), np.nan)
+    b = stations_of([s.points for s in fresh])
+    if not len(a) or not len(b):
+        return out
+    far, which = b.tree.query(a.xy, distance_upper_bound=PARALLEL)
+    there = np.minimum(which, len(b) - 1)
+    step = b.xy[there] - a.xy
+    along = np.abs((step * a.tangent).sum(axis=1)) <= 2.0 * b.spacing[there]
+    turn = np.abs((a.tangent * b.tangent[there]).sum(axis=1))
+    good = np.isfinite(far) & along & (turn >= MIN_COS)
+    return np.where(good, (step * a.normal).sum(axis=1), out)
 
 
 def _moved(
-    name: str, old: Sequence[Element], claims: Claims, need: int, settings: Settings
+    name: str, old: Sequence[Element], claims: Claims, offset: Array, limit: Array, need: int
 ) -> list[Stretch]:
     """Stretches that lie aside by more than offsets of the class usually are."""
     a = claims.stations
-    # A line lies aside of its neighbours; where all lanes have moved, of its place.
-    *ways, sigma = claims.aside(need)
-    limits = [np.maximum(MOVE, MOVE_SIGMAS * _usual(np.abs(w) / sigma) * sigma) for w in ways]
-    alone = np.abs(ways[1]) / limits[1] >= np.abs(ways[0]) / limits[0]
-    offset, limit = np.where(alone, ways[1], ways[0]), np.where(alone, limits[1], limits[0])
     out = []
     for k, e in enumerate(old):
         for side in (1.0, -1.0):
@@ -165,9 +196,12 @@ def _moved(
 
 
 def _usual(sigmas: Array) -> float:
-    """The factor that the sigmas of a class are off by, robustly."""
+    """The factor that the sigmas of a class are off by, by the lower one of two quantiles: here
+    and there lines that moved are most of a map."""
     felt = sigmas[np.isfinite(sigmas)]
-    return 1.4826 * float(np.median(felt)) if len(felt) else 1.0
+    if not len(felt):
+        return 1.0
+    return min(float(np.quantile(felt, q)) / unit for q, unit in GAUSSIAN.items())
 
 
 def _beside(fresh: list[Stretch], moved: Sequence[Stretch]) -> list[Stretch]:
@@ -195,37 +229,6 @@ def _runs(sure: Bool, likely: Bool, order: Int, shortest: float, stations: Stati
     edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(np.int8), [0]])))
     runs = [order[i:j] for i, j in zip(edges[::2], edges[1::2], strict=True) if j - i > 1]
     return [r for r in runs if sure[r].any() and length(stations.xy[r]) >= shortest]
-
-
-def _paired(stretches: list[Stretch]) -> list[Stretch]:
-    """Lost stretches with a new one beside them are moved ones."""
-    import shapely
-
-    lost = [s for s in stretches if s.reason == MISSING_NEW]
-    fresh = [s for s in stretches if s.reason == MISSING_OLD]
-    out, used = [], set()
-    for s in fresh:
-        line = shapely.LineString(s.points)
-        best = None
-        for k, gone in enumerate(lost):
-            if k in used:
-                continue
-            other = shapely.LineString(gone.points)
-            beside = shapely.distance(shapely.points(s.points), other) <= PARALLEL
-            back = shapely.distance(shapely.points(gone.points), line) <= PARALLEL
-            if min(beside.mean(), back.mean()) >= 0.6:
-                best = k
-        if best is None:
-            out.append(s)
-            continue
-        used.add(best)
-        gone = lost[best]
-        out.append(
-            Stretch(
-                MOVED, s.class_name, gone.element_id, s.points, s.confidence, s.drives, gone.points
-            )
-        )
-    return out + [s for k, s in enumerate(lost) if k not in used]
 
 
 # ---- outlines

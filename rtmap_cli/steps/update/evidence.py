@@ -153,8 +153,8 @@ def seen_of(
 def usual_rate(
     elements: Sequence[Element], class_name: str, drives: Sequence[Detected], margin: float
 ) -> float:
-    """How often (by score) frames find an element of a class that is there: the upper half of what is
-    measured on elements of the map, so that those which are gone do not count."""
+    """How often (by score) frames find an element of a class that is there: the upper half of what
+    is measured on elements of the map, so that those which are gone do not count."""
     rates = []
     for e in elements[:: max(1, len(elements) // SAMPLE)]:
         seen = seen_of(e.xy, class_name, drives, margin)
@@ -201,13 +201,18 @@ class Rates:
         """Log-likelihood ratio of one drive's frames between a rate and nothing being there."""
         n = min(float(looked), FRAMES)
         k = found / max(looked, 1) * n
-        odds = k * np.log(rate / self.false) + (n - k) * np.log((1 - rate) / (1 - self.false))
-        return float(np.clip(odds, -SATURATED, SATURATED))
+        return float(
+            k * np.log(rate / self.false) + (n - k) * np.log((1 - rate) / (1 - self.false))
+        )
 
     def log_odds(self, counts: Sequence[tuple[float, int]]) -> float:
         """Of all drives (found, looked) together that the element is there, before any prior."""
-        good = sum(self.vote(self.usual, k, n) for k, n in counts)
-        hard = sum(self.vote(self.hard, k, n) for k, n in counts)
+        good = hard = 0.0
+        for k, n in counts:
+            votes = np.array([self.vote(self.usual, k, n), self.vote(self.hard, k, n)])
+            # Frames of a drive are alike: they say less, which of the rates is the better stays.
+            votes *= min(1.0, SATURATED / max(float(votes.max()), 1e-9))
+            good, hard = np.array([good, hard]) + np.maximum(votes, -SATURATED)
         there = np.logaddexp(np.log(1 - HARD_SHARE) + good, np.log(HARD_SHARE) + hard)
         if not self.clutter:
             return float(there)

@@ -41,7 +41,5 @@ class Settings:
     shortest_m: float = 4.0
     new_m: float = 6.0
     simplify_m: float = 0.1
-    gate_m: float = 1.5
-    same_m: float = 0.8
     lost: float = 0.25
     drives: int = 2

@@ -35,6 +35,8 @@ from rtmap_cli.steps.update.witnesses import Witnesses
 Array = NDArray[np.float64]
 
 KINDS = {MISSING_OLD: "insert", MISSING_NEW: "delete", MOVED: "modify"}
+CANDIDATE = 0.25
+"""From this probability on a stretch is a reason to look at its cell."""
 BEFORE = {"insert": -1.0, "delete": -2.5, "modify": -1.0}
 """Log-odds of a change before the votes: most of a map is right."""
 
@@ -75,7 +77,8 @@ def update(
     kept = [s for s, _ in told]
     cells = judge_cells(list(near), lines, kept, heat, judge, settings)
     flagged = {id(s) for s in flagged_stretches(kept, cells)}
-    events = [(e, s.reason) for s, e in told if id(s) in flagged]
+    least = settings.min_probability
+    events = [(e, s.reason) for s, e in told if id(s) in flagged and e.probability >= least]
     events.sort(key=lambda x: (-x[0].probability, x[0].change_id))
     reasons = {e.change_id: reason for e, reason in events}
     return Update(heat, lines, cells, [e for e, _ in events], reasons)
@@ -112,7 +115,7 @@ def _judged(
             if event.kind == "delete":
                 agreed = counts.traversals_in_view - agreed
             enough = agreed >= min(settings.drives, len(traversals))
-            if enough and event.probability >= settings.min_probability:
+            if enough and event.probability >= min(CANDIDATE, settings.min_probability):
                 out.append((s, event))
     return out
 
