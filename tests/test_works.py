@@ -50,8 +50,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "log").mkdir()
     _log(folder / "log")
     write_new_map(street(), folder / "world", "as ever")
-    words = ["simulate", "changes", "--map", folder / "world", "--works", 40, "--seed", 4,
-             "--near", folder / "log", "-o", folder / "works", "--truth", folder / "truth.json"]  # fmt: skip
+    words = ["simulate", "changes", "--map", folder / "world", "--works", 40, "--seed", 4]
+    words += ["--near", folder / "log", "-o", folder / "works", "--truth", folder / "truth.json"]
     assert run([str(w) for w in words]) == 0
     return folder
 
@@ -66,15 +66,16 @@ def _drives(site: Path, world: str, map_path: Path, runs: Path, first: int, rtma
 
 
 def _off(vector_map: VectorMap, class_name: str, truth: VectorMap) -> float:
-    """The largest distance (m) of a line of a class from the true ones, where it was driven."""
+    """The distance (m) from the true lines of a class that a tenth of the points every 2 m along
+    its lines exceeds, over the works and 10 m around them."""
     lines = shapely.union_all([shapely.LineString(e.xy) for e in truth.of_class(class_name)])
     xy = [
         shapely.get_coordinates(shapely.segmentize(shapely.LineString(e.xy), 2.0))
         for e in vector_map.of_class(class_name)
     ]
     points = np.concatenate(xy)
-    inside = (points[:, 0] > ORIGIN[0]) & (points[:, 0] < ORIGIN[0] + 100.0)
-    return float(shapely.distance(shapely.points(points[inside]), lines).max())
+    inside = (points[:, 0] > ORIGIN[0] - 5.0) & (points[:, 0] < ORIGIN[0] + 57.0)
+    return float(np.quantile(shapely.distance(shapely.points(points[inside]), lines), 0.9))
 
 
 def _stray(vector_map: VectorMap, site: Path) -> float:
@@ -139,8 +140,9 @@ def test_after_the_works_the_map_comes_back(site: Path, tmp_path: Path, rtmap: C
         rtmap("update", runs, "--map", target, "-o", changes)
         rtmap("map", "apply", target, changes, "--all")
         now = read_map(target)
-        assert _off(now, "boundary", truth[world]) < 0.8 < before
-        assert _off(now, "divider", truth[world]) < 0.9
+        assert _off(now, "boundary", truth[world]) < 0.5 < before
+        # Tapers of a lane are moved by less than an update tells.
+        assert _off(now, "divider", truth[world]) < 0.7
         # The same drives have nothing more to say: no flicker.
         again = json.loads(rtmap("update", runs, "--map", target, "-o", changes, "--overwrite",
                                  "--json").out)  # fmt: skip

@@ -176,6 +176,10 @@ def _taken(
 
 
 def _placed(elements: dict[str, Element], source: Element, points: Array, moved: str) -> Change:
-    """What stands there instead."""
-    elements[moved] = Element(moved, source.class_name, points, attributes=source.attributes)
+    """What stands there instead, on the ground of what it stands for."""
+    line = shapely.linestrings(source.xy)
+    at = shapely.line_locate_point(line, shapely.points(points))
+    z = np.interp(at, arc_length(source.xy), source.points[:, 2])
+    new = np.column_stack([points, z])
+    elements[moved] = Element(moved, source.class_name, new, attributes=source.attributes)
     return Change(moved, "insert", source.class_name, points, moved)
