@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from rtmap_cli.formats.change_file import STATES
 from rtmap_cli.formats.changes import CHANGES_SCHEMA, CHANGES_VERSION, KINDS
 from rtmap_cli.formats.geojson import GEOJSON_SCHEMA, GEOJSON_VERSION
 from rtmap_cli.logs.run import RUN_SCHEMA, RUN_VERSION
@@ -11,6 +12,7 @@ from rtmap_cli.logs.semantic import CLASSES, SEMANTIC_SCHEMA, SEMANTIC_VERSION
 from rtmap_cli.logs.tables import LOG_SCHEMA, LOG_VERSION
 from rtmap_cli.maps.delta import MAP_FORMAT, MAP_VERSION
 from rtmap_cli.maps.footprint import ORIGINS, PREFIX, ZOOM
+from rtmap_cli.steps.update.compare import REASONS
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -226,10 +228,18 @@ def _changes_geojson() -> Node:
         "runs": _texts("ids of the runs behind it"),
         "evidence": {"type": "array", "items": _drive_evidence()},
     }
-    own = _object(_versioned(CHANGES_SCHEMA, CHANGES_VERSION), ["schema", "schema_version"])
+    needed = list(properties)
+    properties["map_version"] = _integer("version of the map that the change is about")
+    properties["reason"] = {"enum": list(REASONS), "description": "why `rtmap update` tells it"}
+    properties["review"] = {"enum": list(STATES), "description": "decision; not there: open"}
+    stated = _versioned(CHANGES_SCHEMA, CHANGES_VERSION) | {
+        "map_version": _integer("version of the map that the changes are about"),
+        "crs_of_map": _text("CRS of that map"),
+    }
+    own = _object(stated, ["schema", "schema_version"])
     geometry = _geometry("LineString", "Polygon")
-    node = _collection(properties, list(properties), geometry, rtmap=own)
-    return _document(CHANGES_SCHEMA, "what `rtmap detect-changes` writes", node)
+    node = _collection(properties, needed, geometry, rtmap=own)
+    return _document(CHANGES_SCHEMA, "what `rtmap detect-changes` and `update` write", node)
 
 
 def _drive_evidence() -> Node:

@@ -23,9 +23,9 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def table_schemas() -> dict[str, TableSchema]:
-    """Every TableSchema constant of maps, logs and formats, by name."""
+    """Every TableSchema constant of the rooms that write tables, by name."""
     found: dict[str, TableSchema] = {}
-    for room in ("maps", "logs", "formats"):
+    for room in ("maps", "logs", "formats", "steps.update"):
         package = importlib.import_module(f"rtmap_cli.{room}")
         for module in pkgutil.iter_modules(package.__path__, f"rtmap_cli.{room}."):
             for value in vars(importlib.import_module(module.name)).values():

@@ -165,6 +165,25 @@ TABLES = {
         "weight": "summed weight of all observations of the cell",
         "frames": "frames that saw it",
     },
+    "rtmap.update.heat": {
+        "confidence": "mean over the drives that looked of the share of looks that found the class "
+        "there, weighted by score and nearness; a rank, no probability",
+        "drives": "how many drives stand behind it: 1 where one has it all",
+        "looked": "drives that looked there",
+        "geometry": "WKB point: centre of the grid cell in the map frame",
+    },
+    "rtmap.update.cells": {
+        "ap": "agreement of map and predictions: average precision both ways, the lower one, mean "
+        "over classes; NaN: nothing to compare",
+        "flagged": "whether something in it is to be updated",
+        "reason": "missing in old, missing in new, moved, never observed or unclear; null: agrees",
+        "observed": "share of the cell that some drive looked at",
+        "missing_in_old_m": "metres of stretches that the map lacks",
+        "missing_in_new_m": "metres of stretches that the drives do not find",
+        "moved_m": "metres of stretches that lie elsewhere, where they lay and where they lie",
+        "classes": "the same agreement by class",
+        "geometry": "WKB polygon: the cell in the map frame",
+    },
 }
 
 FILES = {
@@ -182,4 +201,6 @@ FILES = {
     "rtmap.log.sweep": "LOG/lidar/<frame>.parquet",
     "rtmap.semantic.windows": "SEMANTIC/windows.parquet",
     "rtmap.semantic.cells": "SEMANTIC/cells.parquet",
+    "rtmap.update.heat": "REPORT/heat.parquet",
+    "rtmap.update.cells": "REPORT/cells.parquet",
 }

@@ -32,3 +32,23 @@ def test_the_chain_on_a_real_log(av2_log: Path, tmp_path: Path) -> None:
         text=True,
     )
     assert len(json.loads(versions.stdout)["versions"]) == 2
+
+
+def test_a_construction_zone_from_first_to_last_day(tmp_path: Path) -> None:
+    pytest.importorskip("cv2", reason="rendering needs the extra 'simulate'")
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    result = subprocess.run(
+        ["bash", str(ROOT / "examples/construction_zone.sh"), str(tmp_path), "40", "2"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PATH": path},
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    told = {}
+    for name in ("during", "after", "again"):
+        content = json.loads((tmp_path / f"{name}.geojson").read_text("utf-8"))
+        told[name] = [f["properties"] for f in content["features"]]
+    for name in ("during", "after"):
+        assert {p["class"] for p in told[name]} == {"divider", "boundary"}
+        assert not any(p["kind"] == "insert" and p["class"] == "divider" for p in told[name])
+    assert told["again"] == []

@@ -240,6 +240,83 @@ def test_a_file_that_an_editor_saved(
     assert {e.seen for e in found} == {0, 9}
 
 
+def _as_qgis(feature: dict[str, Any], fid: int) -> dict[str, Any]:
+    """A feature as QGIS (OGR's driver) saves it: the id lost or a number, properties in another
+    order with more of them, nulls for what is not set, 15 digits, a Z that nobody asked for."""
+    properties = dict(reversed(feature["properties"].items()))
+    for key in ("runs", "evidence"):
+        if key in properties:
+            properties[key] = json.dumps(properties[key])  # lists become texts
+    properties |= {"fid": fid, "layer": "changes", "path": "/home/x/c.geojson", "note": None}
+    line = [[round(x, 15), round(y, 15), 0.0] for x, y, *_ in feature["geometry"]["coordinates"]]
+    geometry = {"type": "LineString", "coordinates": line}
+    return {"type": "Feature", "properties": properties, "geometry": geometry}
+
+
+def test_qgis_moves_a_vertex_and_adds_a_feature(
+    folder: Path, changes: Path, tmp_path: Path, rtmap: Call
+) -> None:
+    old = read_map(folder).by_id()
+    features = _features(changes)
+    moved, new = _as_qgis(features["moved"], 1), _as_qgis(features["new"], 2)
+    for f in (moved, new):
+        f["properties"]["review"] = "accepted"
+    vertex = moved["geometry"]["coordinates"][1]
+    vertex[1] += 1e-6  # 0.11 m north
+    drawn = json.loads(json.dumps(new))
+    drawn["properties"] = dict.fromkeys(new["properties"]) | {
+        "fid": 3, "kind": "insert", "class": "divider", "review": "accepted", "note": "by hand",
+    }  # fmt: skip
+    for p in drawn["geometry"]["coordinates"]:
+        p[1] += 4e-5
+    name = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
+    saved = tmp_path / "qgis.geojson"
+    collection = {"type": "FeatureCollection", "name": "changes", "crs": name}
+    saved.write_text(json.dumps(collection | {"features": [new, drawn, moved]}, indent=0), "utf-8")
+    told = json.loads(rtmap("map", "apply", folder, saved, "--json").out)
+    assert len(told["inserted"]) == 2 and told["modified"] == ["div-b"]
+    now = read_map(folder).by_id()
+    # Half a metre aside, as the file said, and the vertex where the user put it.
+    step = now["div-b"].xy - old["div-b"].xy
+    assert np.allclose(step[[0, -1]], [0, 0.5], atol=2e-3)
+    assert np.isclose(step[1, 1], 0.61, atol=5e-3)
+    made = [now[k] for k in told["inserted"]]
+    assert sorted(e.seen for e in made) == [0, 9]
+    hand = next(e for e in made if e.seen == 0)
+    assert hand.attributes["note"] == "by hand" and not hand.runs
+    for k in ("div-a", "ped-a", "bou-a"):
+        assert now[k].points.tobytes() == old[k].points.tobytes()
+    rtmap("map", "revert", folder)
+    assert _files(folder, 2) == _files(folder, 0)
+
+
+def test_josm_saves_closed_lines_and_texts(
+    folder: Path, changes: Path, tmp_path: Path, rtmap: Call
+) -> None:
+    """JOSM writes every property as a text, leaves empty ones out, rounds to 1e-7 degrees and makes
+    closed ways polygons or lines as it sees fit."""
+    features = _features(changes)
+    ring, new = features["crossing"], features["new"]
+    for f in (ring, new):
+        kept = {k: v for k, v in f["properties"].items() if v not in (None, [])}
+        f["properties"] = {
+            k: v if isinstance(v, str) else json.dumps(v) for k, v in kept.items()
+        } | {"review": "accepted"}
+        f.pop("id", None)
+    (outline,) = ring["geometry"]["coordinates"]
+    ring["geometry"] = {"type": "LineString", "coordinates": outline}
+    new["geometry"]["coordinates"] = [
+        [round(x, 7), round(y, 7)] for x, y, *_ in new["geometry"]["coordinates"]
+    ]
+    saved = tmp_path / "josm.geojson"
+    collection = {"type": "FeatureCollection", "generator": "JOSM", "features": [new, ring]}
+    saved.write_text(json.dumps(collection), "utf-8")
+    told = json.loads(rtmap("map", "apply", folder, saved, "--json").out)
+    assert told["deleted"] == ["ped-a"] and len(told["inserted"]) == 1
+    (made,) = (read_map(folder).by_id()[k] for k in told["inserted"])
+    assert np.abs(made.xy - line("x", y=50).xy).max() < 0.02 and made.seen == 9
+
+
 def _edit(name: str, kind: str, element: Element, points: Any) -> Edit:
     element_id = None if kind == "insert" else element.element_id
     return Edit(name, kind, element.class_name, element_id, np.asarray(points, float))

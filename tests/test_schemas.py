@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
+from rtmap_cli.cli import run
 from rtmap_cli.formats.geojson import map_collection
 from rtmap_cli.logs.run import run_info
 from rtmap_cli.maps.element import Element, VectorMap
@@ -53,6 +55,7 @@ def violations(node: dict[str, Any], value: Any, where: str = "") -> list[str]:
         "integer": int,
         "number": int | float,
         "null": type(None),
+        "boolean": bool,
     }
     if "const" in node and value != node["const"]:
         return [f"{where}: {value!r} is not {node['const']!r}"]
@@ -110,12 +113,42 @@ def test_changes_follow_their_schema(tmp_path: Path) -> None:
     points = np.array([[585000.0, 4478000], [585010, 4478000]])
     counts = Counts(3, 5, 1, 2, 10, None, ("drive-1",))
     event = ChangeEvent("c1", "delete", "divider", "div-a", points, 0.9, 2.2, counts)
-    write_changes([event], "EPSG:32617", tmp_path / "changes.geojson")
+    info = {"map_version": 3, "crs_of_map": "EPSG:32617"}
+    why = {"c1": "missing in new"}
+    write_changes([event], "EPSG:32617", tmp_path / "changes.geojson", info, why)
+    assert run(["map", "review", str(tmp_path / "changes.geojson"), "--accept", "c1"]) == 0
     value = json.loads((tmp_path / "changes.geojson").read_text(encoding="utf-8"))
     assert violations(schema("rtmap.changes"), value) == []
     found = value["features"][0]["properties"]
     node = schema("rtmap.changes")["properties"]["features"]["items"]["properties"]["properties"]
     assert set(found) == set(node["properties"])
+    write_changes([event], "EPSG:32617", tmp_path / "bare.geojson")
+    bare = json.loads((tmp_path / "bare.geojson").read_text(encoding="utf-8"))
+    assert violations(schema("rtmap.changes"), bare) == []
+    assert set(bare["features"][0]["properties"]) == set(node["required"])
+    found["reason"] = "because"
+    assert violations(schema("rtmap.changes"), value)
+
+
+def test_update_tables_follow_their_schemas(tmp_path: Path) -> None:
+    from fusion_scene import drive, save, street
+
+    for k in range(2):
+        save(drive(street(without=("lane",)), f"run-{k}", seed=k), tmp_path / "runs" / f"{k}")
+    write_new_map(street(), tmp_path / "map", "old")
+    words = ["update", tmp_path / "runs", "--map", tmp_path / "map", "-o", tmp_path / "c.geojson"]
+    assert run([*map(str, words), "--report", str(tmp_path / "report")]) == 0
+    for name in ("heat", "cells"):
+        node = schema(f"rtmap.update.{name}")
+        table = pq.read_table(tmp_path / "report" / f"{name}.parquet")
+        # Parquet names the values of a map once more, behind their type.
+        read = {f.name: str(f.type).replace(f" ('{f.name}')", "") for f in table.schema}
+        assert read == {c["name"]: c["type"] for c in node["columns"]}
+        said = {k.decode(): v.decode() for k, v in table.schema.metadata.items()}
+        assert said["rtmap.schema"] == node["name"] and set(node["metadata"]) <= set(said)
+        assert said["rtmap.units"] == node["units"] and len(table)
+    changes = json.loads((tmp_path / "c.geojson").read_text(encoding="utf-8"))
+    assert changes["features"] and violations(schema("rtmap.changes"), changes) == []
 
 
 def test_logs_follow_their_schema(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -14,8 +15,12 @@ from rtmap_cli.output import emit
 @options.map_path
 @options.map_version
 @click.option(
-    "--change", "specs", multiple=True, required=True,
+    "--change", "specs", multiple=True,
     help="KIND:CLASS or KIND:CLASS*COUNT; delete, insert, move (divider). Repeat it.",
+)  # fmt: skip
+@click.option(
+    "--works", type=options.FiniteRange(16, 500), metavar="METRES",
+    help="A construction zone of so many metres beside the drive of --near.",
 )  # fmt: skip
 @click.option("--near", multiple=True,
               help="Only near this drive: av2:LOG_DIR, LOG, town:. Repeat: near all.")  # fmt: skip
@@ -41,6 +46,7 @@ def command(
     map_path: Path,
     map_version: int | None,
     specs: tuple[str, ...],
+    works: float | None,
     near: tuple[str, ...],
     drive: int,
     route: str,
@@ -53,7 +59,8 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Delete, insert or move elements of MAP; the result is another map.
+    """Delete, insert or move elements of MAP, or open a construction zone; the result is another
+    map.
 
     Changes are named as a fleet sees them, from the outdated map to the world: MAP is the outdated
     map and the output the world, or with --outdate the other way round.
@@ -65,7 +72,7 @@ def command(
     """  # fmt: skip
     import numpy as np
 
-    from rtmap_cli.errors import BadInput
+    from rtmap_cli.errors import BadInput, UsageError
     from rtmap_cli.maps.store import read_map, write_new_map
     from rtmap_cli.steps.simulate.driving.drive_source import Route, find_source, town_info
     from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
@@ -75,8 +82,13 @@ def command(
         parse_spec,
         truth_json,
     )
+    from rtmap_cli.steps.simulate.worlds.works import open_works
     from rtmap_cli.tables import refuse_existing, refuse_over, write_json
 
+    if works is None and not specs:
+        raise UsageError("name a --change, or --works")
+    if works is not None and (specs or outdate or not near):
+        raise UsageError("--works needs --near, and excludes --change and --outdate")
     wanted = [parse_spec(text) for text in specs]
     if truth is not None:
         refuse_existing(truth, overwrite, "choose another --truth or pass --overwrite")
@@ -91,16 +103,24 @@ def command(
         sources = [find_source(name, map_path, old, key, way) for name in near]
         path = common_path([s.drive.pose[:, :2, 3] for s in sources])
     rng = np.random.default_rng([seed, 61])
-    made = [s.inverse() for s in wanted] if outdate else wanted
-    new, changes = change_world(old, made, rng, path)
+    info: dict[str, Any] = {"changes": list(specs), "seed": seed, "outdated": outdate}
+    delineators: list[Any] = []
+    if works is not None:
+        assert path is not None
+        site = open_works(old, path, works, rng)
+        new, changes, delineators = site.world, site.changes, site.delineators
+        info["works_m"] = works
+    else:
+        made = [s.inverse() for s in wanted] if outdate else wanted
+        new, changes = change_world(old, made, rng, path)
     if outdate:
         changes = [c.flipped() for c in changes]
     known = town_info(map_path)
-    info = {"changes": list(specs), "seed": seed, "outdated": outdate}
     if "town" in known:
         info["town"] = known["town"]
-    write_new_map(new, output, f"simulated changes: {', '.join(specs)}", overwrite, info=info)
-    told = truth_json(changes, old.crs)
+    what = f"{works:g} m of works" if works is not None else ", ".join(specs)
+    write_new_map(new, output, f"simulated changes: {what}", overwrite, info=info)
+    told = truth_json(changes, old.crs, delineators)
     if truth is not None:
         write_json(told, truth)
     lines = [

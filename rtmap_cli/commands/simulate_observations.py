@@ -11,6 +11,9 @@ from rtmap_cli import options
 from rtmap_cli.output import emit, progress
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from rtmap_cli.logs.run import Poses
     from rtmap_cli.maps.element import VectorMap
     from rtmap_cli.steps.simulate.driving.drives import Drive
@@ -49,6 +52,11 @@ LOG_RATE, ROUTE_SPACING = 2.0, 2.5
     "prior_path",
     type=options.PATH,
     help="Outdated map: its elements become prior queries.",
+)
+@click.option(
+    "--works",
+    type=options.PATH,
+    help="Truth file of `simulate changes --works`: its delineators stand in the road.",
 )
 @click.option(
     "--route",
@@ -100,6 +108,7 @@ def command(
     world_seed: int,
     traversal: int,
     prior_path: Path | None,
+    works: Path | None,
     route: str | None,
     route_length: float,
     spacing: float | None,
@@ -139,6 +148,7 @@ def command(
     refuse_existing(truth_file, overwrite, "choose another --truth-poses or pass --overwrite")
     world = read_map(map_path, map_version)
     prior = read_map(prior_path) if prior_path is not None else None
+    delineators = _delineators(works, world.crs) if works is not None else []
     drive, source = _drive(log_path, route, route_length, spacing, rate, lateral, key)
     for path, vector_map in ((map_path, world), (prior_path, prior)):
         if path is not None and vector_map is not None:
@@ -155,13 +165,13 @@ def command(
         "map": str(map_path), "map_version": world.version,
         "prior": str(prior_path) if prior_path else None,
         "prior_version": prior.version if prior else None,
-        "log": log_path, "preset_name": preset, **source,
+        "log": log_path, "preset_name": preset, **source, "works": str(works) if works else None,
     }  # fmt: skip
     with whole_folder(output, overwrite) as folder:
         run, truth = observe(
             world, drive, model, key, label, prior,
             progress=lambda frames: progress(frames, "frames", len(drive), quiet),
-            made_by=made_by,
+            made_by=made_by, delineators=delineators,
         )  # fmt: skip
         write_run(run, folder)
         _write_truth(truth, truth_file, run.crs)
@@ -213,6 +223,30 @@ def _drive(
         if truth is None:
             raise BadInput(log_path, "has no true poses", "use a simulated or an Argoverse 2 log")
     return drive_of_log(log, truth, lateral), said
+
+
+def _delineators(path: Path, crs: str) -> list[NDArray[np.float64]]:
+    """The rows of posts (n, 2) of a truth file, in the map frame; BadInput when it has none."""
+    import numpy as np
+
+    from rtmap_cli.errors import BadInput
+    from rtmap_cli.maps.crs import lonlat_to
+    from rtmap_cli.tables import read_json
+
+    told = read_json(path)
+    rows = told.get("delineators") if isinstance(told, dict) else None
+    if not isinstance(rows, list) or not rows:
+        raise BadInput(path, "names no delineators", "write it with `simulate changes --works`")
+    out = []
+    for row in rows:
+        try:
+            lonlat = np.asarray(row, np.float64)
+        except (TypeError, ValueError):
+            lonlat = np.zeros(0)
+        if lonlat.ndim != 2 or lonlat.shape[1] != 2 or not np.isfinite(lonlat).all():
+            raise BadInput(path, "its delineators are no lists of longitude and latitude")
+        out.append(lonlat_to(crs, lonlat))
+    return out
 
 
 def _without_traffic(drive: Drive) -> Drive:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rtmap_cli.geometry.polylines import clip_to_box, length
 from rtmap_cli.maps.element import RING_CLASSES, Element
 from rtmap_cli.steps.update.accumulate import Heat
-from rtmap_cli.steps.update.compare import REASONS, Stretch
+from rtmap_cli.steps.update.compare import MOVED, REASONS, Stretch
 from rtmap_cli.steps.update.outlines import Line
 from rtmap_cli.steps.update.settings import Settings
 
@@ -34,6 +34,8 @@ OBSERVED = 0.25
 """Share of a cell that some drive must have looked at."""
 LEAST = 1.0
 """Metres of a stretch in a cell that make it a reason."""
+PLENTY = 2.0
+"""Metres of a stretch that are a reason whatever the precision is."""
 PIECE = 0.5
 """Shorter pieces (m) that a cell cuts off are none."""
 
@@ -114,9 +116,10 @@ def _places(stretch: Stretch) -> list[Array]:
 
 
 def _reason(lowest: float, metres: dict[str, float], observed: float, settings: Settings) -> str:
-    if lowest >= settings.max_ap:
-        return ""
     name = max(REASONS, key=lambda r: metres[r])
+    # A few metres of a long line that goes on cost no precision; one that moved far does.
+    if lowest >= settings.max_ap and (name == MOVED or metres[name] < PLENTY):
+        return ""
     if metres[name] >= LEAST:
         return name
     return NEVER if observed < OBSERVED else UNCLEAR

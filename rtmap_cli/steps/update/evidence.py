@@ -21,6 +21,7 @@ from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.element import RING_CLASSES, Element
 from rtmap_cli.maps.evidence import Counts, DriveEvidence
 from rtmap_cli.maps.visibility import views
+from rtmap_cli.steps.update.claims import Drive
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -56,36 +57,47 @@ class Detected:
     traversal: Traversal
     tree: Any
     xy: Array
-    row: Int
+    score: Array
 
     @staticmethod
-    def of(traversal: Traversal, class_name: str) -> Detected:
-        """Points along the lines of a class, or the middles of its outlines."""
+    def of(traversal: Traversal, class_name: str, chosen: Int | None = None) -> Detected:
+        """Points along the lines of a class, or the middles of its outlines; of all detections or
+        of the ``chosen`` rows."""
         from scipy.spatial import cKDTree
 
-        mine = np.flatnonzero(traversal.class_name == class_name)
+        mine = np.flatnonzero(traversal.class_name == class_name) if chosen is None else chosen
         if class_name in RING_CLASSES:
             which, xy = np.arange(len(mine)), traversal.points[mine][:, :-1].mean(axis=1)
         else:
             which, xy, _ = points_along(traversal.points[mine], NEAR)
-        xy, frame = xy.reshape(-1, 2), traversal.frame[mine[which]]
-        return Detected(traversal, cKDTree(_lifted(xy, frame)), xy, mine[which])
+        xy, row = xy.reshape(-1, 2), mine[which]
+        tree = cKDTree(_lifted(xy, traversal.frame[row]))
+        return Detected(traversal, tree, xy, traversal.score[row])
+
+    @staticmethod
+    def of_samples(drive: Drive, index: Int, raw: bool = False) -> Detected:
+        """Some of the samples of a drive, as they were put onto the map, or ``raw``."""
+        from scipy.spatial import cKDTree
+
+        s = drive.samples
+        xy = s.xy[index] - raw * drive.shift[index]
+        return Detected(drive.traversal, cKDTree(_lifted(xy, s.frame[index])), xy, s.score[index])
 
     def found(
         self, xy: Array, frame: Int, near: float, rivals: Any = None
     ) -> tuple[NDArray[np.bool_], Int]:
         """Whether some detection of its frame lies within ``near`` metres of each point (n, 2), and
-        its row; one that lies nearer to a line of ``rivals`` (shapely) is that line's."""
-        if not len(self.row):
+        its number; one that lies nearer to a line of ``rivals`` (shapely) is that line's."""
+        if not len(self.xy):
             return np.zeros(len(xy), bool), np.zeros(len(xy), np.int64)
         far, at = self.tree.query(_lifted(xy, frame), distance_upper_bound=near)
-        hit, at = np.isfinite(far), np.minimum(at, len(self.row) - 1)
+        hit, at = np.isfinite(far), np.minimum(at, len(self.xy) - 1)
         if rivals is not None and hit.any():
             import shapely
 
             other = shapely.distance(shapely.points(self.xy[at[hit]]), rivals)
             hit[hit] = far[hit] <= other
-        return hit, self.row[at]
+        return hit, np.asarray(at, np.int64)
 
 
 def _lifted(xy: Array, frame: Int) -> Array:
@@ -96,11 +108,12 @@ def _lifted(xy: Array, frame: Int) -> Array:
 @dataclass(frozen=True)
 class Seen:
     """Frames of one drive that had a stretch in view (``times``, ns), which of them ``found`` it,
-    and the mean score of what they found (None: nothing)."""
+    the ``scores`` of what they found (0: nothing), and their mean (None: nothing)."""
 
     run_id: str
     times: Int
     found: NDArray[np.bool_]
+    scores: Array
     score: float | None
     first_ns: int
 
@@ -122,30 +135,34 @@ def seen_of(
         pairs = views(places, t.pose, t.range_m, t.occluders, margin)
         count = np.bincount(pairs.frame, minlength=len(t.pose))
         near = RING_NEAR if ring else NEAR
-        hit, row = d.found(places[pairs.point], pairs.frame, near, rivals)
+        hit, at = d.found(places[pairs.point], pairs.frame, near, rivals)
         hits = np.bincount(pairs.frame, hit, len(t.pose))
         looked = np.flatnonzero(count >= max(min(HALF * len(places), ENOUGH), 1))
         found = hits[looked] >= HALF * count[looked]
-        used = hit & np.isin(pairs.frame, looked[found])
-        score = float(t.score[row[used]].mean()) if used.any() else None
+        scores = np.zeros(len(t.pose))
+        if hit.any():
+            total = np.bincount(pairs.frame[hit], d.score[at[hit]], len(t.pose))
+            scores = total / np.maximum(hits, 1.0)
+        scores = np.where(found, scores[looked], 0.0)
+        score = float(scores[found].mean()) if found.any() else None
         times = t.timestamp_ns[looked]
-        out.append(Seen(t.run_id, times, found, score, int(t.timestamp_ns[0])))
+        out.append(Seen(t.run_id, times, found, scores, score, int(t.timestamp_ns[0])))
     return out
 
 
 def usual_rate(
     elements: Sequence[Element], class_name: str, drives: Sequence[Detected], margin: float
 ) -> float:
-    """How often frames find an element of a class that is there: the upper half of what is
-    measured on elements of the map, so that those which are gone do not count."""
+    """How often (by score) frames find an element of a class that is there: the upper half of what
+    is measured on elements of the map, so that those which are gone do not count."""
     rates = []
     for e in elements[:: max(1, len(elements) // SAMPLE)]:
         seen = seen_of(e.xy, class_name, drives, margin)
         looks = sum(len(s.times) for s in seen)
         if looks >= 4:
-            rates.append(sum(int(s.found.sum()) for s in seen) / looks)
+            rates.append(sum(float(s.scores.sum()) for s in seen) / looks)
     good = [r for r in rates if r > 2 * FALSE_RATE]
-    return float(np.clip(np.median(good), 0.3, 0.95)) if good else 0.7
+    return float(np.clip(np.median(good), 0.2, 0.95)) if good else 0.7
 
 
 def aside_rate(
@@ -153,56 +170,66 @@ def aside_rate(
     class_name: str,
     drives: Sequence[Detected],
     margin: float,
-    rivals: Any,
 ) -> float:
     """How often frames find a line where there is none but one beside it: the tails of its errors,
     measured ``ASIDE`` metres to both sides of lines of the map."""
-    found = looks = 0
+    found, looks = 0.0, 0
     for e in elements[:: max(1, len(elements) // SAMPLE)]:
         places = resample_step(e.xy, STEP)
         for side in (ASIDE, -ASIDE):
-            for s in seen_of(places + side * normals(places), class_name, drives, margin, rivals):
-                found, looks = found + int(s.found.sum()), looks + len(s.times)
+            for s in seen_of(places + side * normals(places), class_name, drives, margin):
+                found, looks = found + float(s.scores.sum()), looks + len(s.times)
     return float(np.clip(found / max(looks, 1), FALSE_RATE, 0.3))
 
 
 @dataclass(frozen=True)
 class Rates:
-    """How often frames find an element of a class that is there, one that is worn, and none."""
+    """How often frames find an element of a class that is there, one that is worn, and none;
+    ``clutter``: share of places without a line at which something is taken for one as often as for
+    a worn one, in every drive: posts, kerbs, seams."""
 
     usual: float
     false: float = FALSE_RATE
+    clutter: float = 0.0
 
     @property
     def hard(self) -> float:
         """Of what is worn."""
         return max(HARD * self.usual, 2 * self.false)
 
-    def vote(self, rate: float, found: int, looked: int) -> float:
+    def vote(self, rate: float, found: float, looked: int) -> float:
         """Log-likelihood ratio of one drive's frames between a rate and nothing being there."""
         n = min(float(looked), FRAMES)
         k = found / max(looked, 1) * n
-        odds = k * np.log(rate / self.false) + (n - k) * np.log((1 - rate) / (1 - self.false))
-        return float(np.clip(odds, -SATURATED, SATURATED))
+        return float(
+            k * np.log(rate / self.false) + (n - k) * np.log((1 - rate) / (1 - self.false))
+        )
 
-    def log_odds(self, counts: Sequence[tuple[int, int]]) -> float:
+    def log_odds(self, counts: Sequence[tuple[float, int]]) -> float:
         """Of all drives (found, looked) together that the element is there, before any prior."""
-        good = sum(self.vote(self.usual, k, n) for k, n in counts)
-        hard = sum(self.vote(self.hard, k, n) for k, n in counts)
-        return float(np.logaddexp(np.log(1 - HARD_SHARE) + good, np.log(HARD_SHARE) + hard))
+        good = hard = 0.0
+        for k, n in counts:
+            votes = np.array([self.vote(self.usual, k, n), self.vote(self.hard, k, n)])
+            # Frames of a drive are alike: they say less, which of the rates is the better stays.
+            votes *= min(1.0, SATURATED / max(float(votes.max()), 1e-9))
+            good, hard = np.array([good, hard]) + np.maximum(votes, -SATURATED)
+        there = np.logaddexp(np.log(1 - HARD_SHARE) + good, np.log(HARD_SHARE) + hard)
+        if not self.clutter:
+            return float(there)
+        return float(there - np.logaddexp(np.log1p(-self.clutter), np.log(self.clutter) + hard))
 
 
 def counts_of(seen: Sequence[Seen], rates: Rates) -> tuple[Counts, float]:
     """All drives, each with its own vote, oldest first; and what they say together."""
     looked = sorted((s for s in seen if len(s.times)), key=lambda s: (s.first_ns, s.run_id))
-    pairs = [(int(s.found.sum()), len(s.times)) for s in looked]
+    pairs = [(float(s.scores.sum()), len(s.times)) for s in looked]
     drives = []
     for s, pair in zip(looked, pairs, strict=True):
         odds = rates.log_odds([pair])
         times = tuple(s.times[s.found].tolist())
         drives.append(
             DriveEvidence(
-                s.run_id, s.first_ns, pair[1], pair[0], times, s.score, odds, True, odds > 0
+                s.run_id, s.first_ns, pair[1], len(times), times, s.score, odds, True, odds > 0
             )
         )
     times = tuple(t for d in drives for t in d.seen_ns)

@@ -104,7 +104,7 @@ def first_map(
     common: float = 0.0,
 ) -> list[Element]:
     """The lines of the grids as elements, where enough drives stand behind them."""
-    heat = accumulate(traversals, classes, layout_of(traversals, settings), settings)
+    heat = accumulate(traversals, classes, layout_of(traversals, settings), settings).heat
     model = max((t.timestamp_ns[-1], t.model_sha256 or "") for t in traversals)[1] or None
     out: list[Element] = []
     taken: set[str] = set()

@@ -20,8 +20,7 @@ class Settings:
     are joined there and over gaps; ``shortest_m``: shorter lines and changes are not told, nor new
     lines shorter than ``new_m``;
     ``simplify_m``: what a simplified line may be off.
-    ``gate_m``, ``same_m``: lines of old and new within ``gate_m`` may be one, within ``same_m``
-    they are; ``lost``: share of the usual confidence below which an old line is not there;
+    ``lost``: share of the usual confidence below which an old line is not there;
     ``drives``: how many must agree on something new, where so many looked.
     """
 
@@ -41,7 +40,5 @@ class Settings:
     shortest_m: float = 4.0
     new_m: float = 6.0
     simplify_m: float = 0.1
-    gate_m: float = 1.5
-    same_m: float = 0.8
-    lost: float = 0.15
+    lost: float = 0.25
     drives: int = 2

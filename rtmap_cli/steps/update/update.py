@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.formats.changes import ChangeEvent
+from rtmap_cli.geometry.blocks import Layout
 from rtmap_cli.geometry.polylines import is_ring
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.element import RING_CLASSES, VectorMap
@@ -17,6 +18,7 @@ from rtmap_cli.maps.evidence import Counts
 from rtmap_cli.maps.existence import probability
 from rtmap_cli.steps.update.accumulate import Heat, accumulate, layout_of
 from rtmap_cli.steps.update.cells import Cell, Judge, flagged_stretches, judge_cells
+from rtmap_cli.steps.update.claims import Claims
 from rtmap_cli.steps.update.compare import (
     MISSING_NEW,
     MISSING_OLD,
@@ -25,23 +27,16 @@ from rtmap_cli.steps.update.compare import (
     compare,
     usual_of,
 )
-from rtmap_cli.steps.update.evidence import (
-    Detected,
-    Rates,
-    aside_rate,
-    counts_of,
-    seen_of,
-    usual_rate,
-)
 from rtmap_cli.steps.update.outlines import Line
 from rtmap_cli.steps.update.settings import Settings
 from rtmap_cli.steps.update.vectorise import usual_confidence, vectorise
+from rtmap_cli.steps.update.witnesses import Witnesses
 
 Array = NDArray[np.float64]
 
 KINDS = {MISSING_OLD: "insert", MISSING_NEW: "delete", MOVED: "modify"}
-BESIDE = 2.5
-"""What is new so near (m) to a line of its class may be that line's errors."""
+CANDIDATE = 0.25
+"""From this probability on a stretch is a reason to look at its cell."""
 BEFORE = {"insert": -1.0, "delete": -2.5, "modify": -1.0}
 """Log-odds of a change before the votes: most of a map is right."""
 
@@ -65,33 +60,37 @@ def update(
     settings: Settings,
 ) -> Update:
     """What some drives say of a map: cells that differ, and the changes that put them right."""
-    heat = accumulate(traversals, classes, layout_of(traversals, settings), settings)
-    near = _in_reach(old, heat)
+    layout = layout_of(traversals, settings)
+    near = _in_reach(old, layout)
+    found = accumulate(traversals, classes, layout, settings, near)
+    heat = found.heat
     lines: list[Line] = []
     stretches: list[Stretch] = []
     for name in classes:
         mine = near.of_class(name)
         usual = usual_of(mine, heat, usual_confidence(heat, name))
-        found = vectorise(heat, name, usual, settings)
-        lines += found
-        stretches += compare(mine, found, heat, usual, settings)
-    told = _judged(stretches, traversals, near, settings)
+        all_ = vectorise(heat, name, usual, settings)
+        lines += all_
+        left = vectorise(found.rest, name, usual, settings) if mine else all_
+        stretches += compare(name, mine, left, found, usual, settings)
+    told = _judged(stretches, traversals, near, found.claims, settings)
     kept = [s for s, _ in told]
     cells = judge_cells(list(near), lines, kept, heat, judge, settings)
     flagged = {id(s) for s in flagged_stretches(kept, cells)}
-    events = [(e, s.reason) for s, e in told if id(s) in flagged]
+    least = settings.min_probability
+    events = [(e, s.reason) for s, e in told if id(s) in flagged and e.probability >= least]
     events.sort(key=lambda x: (-x[0].probability, x[0].change_id))
     reasons = {e.change_id: reason for e, reason in events}
     return Update(heat, lines, cells, [e for e, _ in events], reasons)
 
 
-def _in_reach(old: VectorMap, heat: Heat) -> VectorMap:
+def _in_reach(old: VectorMap, layout: Layout) -> VectorMap:
     """The elements of which some vertex lies in a block of the grids."""
     points = [e.xy for e in old]
     if not points:
         return old
-    cells = np.floor(np.concatenate(points) / heat.layout.cell).astype(np.int64)
-    there = heat.layout.places(cells) >= 0
+    cells = np.floor(np.concatenate(points) / layout.cell).astype(np.int64)
+    there = layout.places(cells) >= 0
     owner = np.repeat(np.arange(len(points)), [len(p) for p in points])
     kept = np.bincount(owner, there, len(points)) > 0
     return VectorMap([e for e, k in zip(old, kept, strict=True) if k], old.crs, old.version)
@@ -101,41 +100,22 @@ def _judged(
     stretches: Sequence[Stretch],
     traversals: Sequence[Traversal],
     old: VectorMap,
+    claims: Mapping[str, Claims],
     settings: Settings,
 ) -> list[tuple[Stretch, ChangeEvent]]:
     """The stretches whose drives' votes make them probable enough, as changes."""
-    import shapely
-
     out = []
     for name in dict.fromkeys(s.class_name for s in stretches):
-        drives = [Detected.of(t, name) for t in traversals]
         mine = [s for s in stretches if s.class_name == name]
-        gone = {s.element_id for s in mine}
-        there = [e for e in old.of_class(name) if e.element_id not in gone]
-        alone = Rates(usual_rate(there, name, drives, settings.margin_m))
-        beside, kept = alone, None
-        if name not in RING_CLASSES and there:
-            kept = shapely.union_all([shapely.LineString(e.xy) for e in there])
-            false = aside_rate(there, name, drives, settings.margin_m, kept)
-            beside = Rates(max(alone.usual, 1.5 * false), false)
+        witness = Witnesses(traversals, old.of_class(name), name, claims.get(name), settings)
         for s in mine:
-            near = kept is not None and s.reason != MISSING_NEW
-            near = near and shapely.distance(shapely.LineString(s.points), kept) < BESIDE
-            rivals = kept
-            if len(s.before) > 1 and name not in RING_CLASSES:
-                # What is nearer to where it lay does not say that it moved.
-                was = shapely.LineString(s.before)
-                rivals = was if kept is None else shapely.union(was, kept)
-            counts, votes = counts_of(
-                seen_of(s.points, name, drives, settings.margin_m, rivals),
-                beside if near else alone,
-            )
+            counts, votes = witness.say(s)
             event = _event(s, counts, votes)
             agreed = counts.traversals_seen
             if event.kind == "delete":
                 agreed = counts.traversals_in_view - agreed
-            enough = agreed >= min(settings.drives, len(drives))
-            if enough and event.probability >= settings.min_probability:
+            enough = agreed >= min(settings.drives, len(traversals))
+            if enough and event.probability >= min(CANDIDATE, settings.min_probability):
                 out.append((s, event))
     return out
 

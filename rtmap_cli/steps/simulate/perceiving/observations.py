@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from rtmap_cli.errors import NoAnswer
 from rtmap_cli.logs.log import Occluder
@@ -14,6 +15,7 @@ from rtmap_cli.logs.run import OCCLUDERS, Observations, Poses, Run, run_info, tr
 from rtmap_cli.maps.crop import DEFAULT_RANGE, Range
 from rtmap_cli.maps.element import CLASSES, VectorMap
 from rtmap_cli.steps.simulate.driving.drives import Drive, initial_poses
+from rtmap_cli.steps.simulate.perceiving.clutter import Clutter
 from rtmap_cli.steps.simulate.perceiving.perception import (
     VERTICES,
     Detection,
@@ -25,6 +27,7 @@ from rtmap_cli.steps.simulate.perceiving.perception import (
 from rtmap_cli.steps.simulate.perceiving.presets import Preset
 from rtmap_cli.steps.simulate.perceiving.prior_queries import PriorPerception
 
+Array = NDArray[np.float64]
 Progress = Callable[[Iterable[int]], Iterator[int]]
 
 
@@ -38,16 +41,19 @@ def observe(
     range_m: Range = DEFAULT_RANGE,
     progress: Progress = iter,
     made_by: dict[str, Any] | None = None,
+    delineators: Sequence[Array] = (),
 ) -> tuple[Run, Poses]:
     """The run that a network would write of a drive through ``world``, and its true poses.
 
-    With ``prior`` its elements become queries. ``made_by`` goes into run.json. Everything random
-    hangs on ``key``: errors fixed to the place on its world seed, the rest on the drive.
+    With ``prior`` its elements become queries. ``made_by`` goes into run.json. ``delineators`` are
+    rows of posts (n, 2), map frame, which are taken for dividers at times. Everything random hangs
+    on ``key``: errors fixed to the place on its world seed, the rest on the drive.
     Raises NoAnswer when nothing of the world is ever in range.
     """
     perception = Perception(world, preset, key, range_m)
     frames = initial_poses(drive, preset, key)
     false = FalseElements(perception, drive.pose)
+    clutter = Clutter(delineators, perception.errors, preset.ghost_score)
     asked = PriorPerception(perception, prior, frames.sigma[0]) if prior is not None else None
     boxes = drive.occluders or [()] * len(drive)
     reported: list[list[Detection]] = []
@@ -56,6 +62,7 @@ def observe(
         view = View(i, drive.pose[i], boxes[i])
         pieces = asked.new_pieces(view) if asked else perception.pieces(view)
         found = [d for p in pieces if (d := perception.detect(p, view))] + false.of(view)
+        found += clutter.of(view, range_m)
         # A network's queries come in no order that tells what is real.
         found.sort(key=lambda d: -d.score)
         answers = asked.queries(view, frames.initial[i]) if asked else []

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rtmap_cli.errors import NoAnswer, UsageError
-from rtmap_cli.geometry.polylines import arc_length, is_ring, normals, resample, tangents
+from rtmap_cli.geometry.polylines import arc_length, is_ring, length, normals, resample, tangents
 from rtmap_cli.maps.crs import to_lonlat
 from rtmap_cli.maps.element import CLASSES, RING_CLASSES, Element, VectorMap
 from rtmap_cli.steps.simulate.worlds.world import even_odd_surface
@@ -81,9 +81,15 @@ class Change:
         return out
 
 
-def truth_json(changes: Sequence[Change], crs: str) -> dict[str, Any]:
-    """The truth file: ``{"crs", "changes": […]}``, kinds seen from the outdated map."""
-    return {"crs": crs, "changes": [c.as_json(crs) for c in changes]}
+def truth_json(
+    changes: Sequence[Change], crs: str, delineators: Sequence[Array] = ()
+) -> dict[str, Any]:
+    """The truth file: ``{"crs", "changes": […]}``, kinds seen from the outdated map; of works also
+    the rows of ``delineators`` (n, 2)."""
+    told: dict[str, Any] = {"crs": crs, "changes": [c.as_json(crs) for c in changes]}
+    if delineators:
+        told["delineators"] = [np.round(to_lonlat(crs, row), 8).tolist() for row in delineators]
+    return told
 
 
 def parse_spec(text: str) -> ChangeSpec:
@@ -202,12 +208,12 @@ class _Work:
             return None
         if s[-1] < wanted + MIN_REST:
             whole = (0.0, float(s[-1]))
-            return whole if self._free(_part(element.points, *whole)[:, :2]) else None
+            return whole if self._free(part_of(element.points, *whole)[:, :2]) else None
         for _ in range(12):
             start = float(self.rng.uniform(0.0, s[-1] - wanted))
             if self.path is not None and s[-1] > 60:
                 start = self._near_start(element, s, wanted)
-            piece = _part(element.points, start, start + wanted)[:, :2]
+            piece = part_of(element.points, start, start + wanted)[:, :2]
             if self._free(piece) and self._compact(piece):
                 return start, start + wanted
         return None
@@ -216,7 +222,7 @@ class _Work:
         """A start station such that the stretch lies near a random place of the path."""
         assert self.path is not None
         place = self.path[int(self.rng.integers(len(self.path)))]
-        line = _part(element.points, 0.0, float(s[-1]), 1.0)
+        line = part_of(element.points, 0.0, float(s[-1]), 1.0)
         nearest = int(np.hypot(*(line[:, :2] - place).T).argmin())
         middle = float(arc_length(line)[nearest]) + self.rng.normal(0, 3.0)
         return float(np.clip(middle - wanted / 2, 0.0, s[-1] - wanted))
@@ -230,29 +236,11 @@ class _Work:
             stretch = self._stretch(element)
             if stretch is None:
                 continue
-            self._cut(element, *stretch)
-            gone = _part(element.points, *stretch)[:, :2]
+            cut_out(self.elements, element, *stretch)
+            gone = part_of(element.points, *stretch)[:, :2]
             self._record(Change(element.element_id, "delete", class_name, gone, moved))
             return True
         return False
-
-    def _cut(self, element: Element, start: float, end: float) -> None:
-        """Take a stretch out of a line; the rests keep the id with #a and #b behind it."""
-        total = float(arc_length(element.points)[-1])
-        del self.elements[element.element_id]
-        points = element.points
-        if is_ring(points):
-            rest = np.concatenate([_part(points, end, total), _part(points, 0.0, start)[1:]])
-            self._keep(element, "#a", rest)
-            return
-        if start > MIN_REST:
-            self._keep(element, "#a", _part(points, 0.0, start))
-        if total - end > MIN_REST:
-            self._keep(element, "#b", _part(points, end, total))
-
-    def _keep(self, element: Element, suffix: str, points: Array) -> None:
-        name = element.element_id + suffix
-        self.elements[name] = replace(element, element_id=name, points=points, covariance=None)
 
     def _insert_ring(self, class_name: str) -> bool:
         """A crossing straight across the road, at a right angle to the way."""
@@ -353,7 +341,23 @@ class _Work:
         return out
 
 
-def _part(points: Array, start: float, end: float, step: float | None = None) -> Array:
+def cut_out(elements: dict[str, Element], element: Element, start: float, end: float) -> None:
+    """Take a stretch (m) out of one of the elements; the rests keep the id with #a and #b behind
+    it, unless they are short."""
+    points = element.points
+    total = float(arc_length(points)[-1])
+    del elements[element.element_id]
+    if is_ring(points):
+        rests = [np.concatenate([part_of(points, end, total), part_of(points, 0.0, start)[1:]])]
+    else:
+        rests = [part_of(points, 0.0, start), part_of(points, end, total)]
+    for suffix, rest in zip("ab", rests, strict=False):
+        if is_ring(points) or length(rest) > MIN_REST:
+            name = f"{element.element_id}#{suffix}"
+            elements[name] = replace(element, element_id=name, points=rest, covariance=None)
+
+
+def part_of(points: Array, start: float, end: float, step: float | None = None) -> Array:
     """The stretch of a line between two stations, its vertices kept (or every ``step`` m)."""
     s = arc_length(points)
     inner = s[(s > start + 1e-6) & (s < end - 1e-6)]
