@@ -21,7 +21,7 @@ from rtmap_cli.geometry.poses import transform
 from rtmap_cli.logs.log import Camera
 from rtmap_cli.logs.semantic import Window
 from rtmap_cli.maps.element import VectorMap
-from rtmap_cli.steps.semantic.evidence import Weighting
+from rtmap_cli.steps.semantic.evidence import Weighting, floored
 from rtmap_cli.steps.semantic.observe import Sweep, semantic_points
 from rtmap_cli.steps.semantic.project import View
 from rtmap_cli.steps.semantic.raster import Raster
@@ -108,7 +108,7 @@ class PixelMask:
         size = len(fields)
         return np.asarray(fields[(row + i) % size, (column + j) % size, layer])
 
-    def _labels(self, row: Array, column: Array) -> Bytes:
+    def _labels(self, row: NDArray[Any], column: NDArray[Any]) -> Bytes:
         k = self.camera.intrinsics
         y = (row - k[1, 2]) / k[1, 1]
         x = (column - k[0, 2] - k[0, 1] * y) / k[0, 0]
@@ -165,7 +165,8 @@ def _rasters(
     path = on_springs(with_vehicles(source.drive, source, world.surface, key, None), source, key)
     poses = initial_trajectory(list(frames_of(path, key)))[0]
     ground, style = labels.GroundLabels(world), make_style(generator(*key.drive, "style"))
-    rig, lidar, weighting = domain.cameras(), domain.rays(), Weighting()
+    rig, lidar = domain.cameras(), domain.rays()
+    weighting = Weighting(confusion=floored(domain.confusion()))
     classes = domain.class_table()
     raster = Raster(config.raster_cell_m)
     window = Window(*config.raster_half_m, config.raster_cell_m)

@@ -32,7 +32,8 @@ class Loaded:
 class Source(Protocol):
     """Reads frames of a log for a network; ``cameras`` are the names of those that it looks at."""
 
-    cameras: Sequence[str]
+    @property
+    def cameras(self) -> Sequence[str]: ...
 
     def load(self, frame: Frame) -> Loaded:
         """What the network is given of a frame; BadInput when that cannot be read."""
