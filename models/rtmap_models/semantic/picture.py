@@ -29,5 +29,5 @@ def cropped(picture: Tensor, config: SemanticConfig) -> Tensor:
 @torch.no_grad()
 def wide_picture(raster: NDArray[np.uint8], config: SemanticConfig) -> NDArray[np.uint8]:
     """(·, ·, K) what a training frame keeps of one raster (K, rows, columns)."""
-    picture = to_picture(torch.from_numpy(raster)[None].float(), config)[0]
+    picture = to_picture(torch.from_numpy(raster.astype(np.float32))[None], config)[0]
     return picture.round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
