@@ -1,4 +1,4 @@
-"""The network that a configuration describes: one interface, two architectures.
+"""The network that a configuration describes: one interface, three architectures.
 
 Every network has ``config``; ``forward`` (the exported graph, docs/model-contract.md);
 ``predict_batch(batch, bf16=False)`` → the output of every layer; ``losses(batch, bf16)`` → the
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from torch import nn
 
-from rtmap_models.config import ModelConfig, PaperConfig, TinyConfig
+from rtmap_models.config import ModelConfig, PaperConfig, SemanticConfig, TinyConfig
 
 
 def build_network(config: ModelConfig) -> nn.Module:
@@ -18,6 +18,10 @@ def build_network(config: ModelConfig) -> nn.Module:
         from rtmap_models.paper.network import build_paper_network
 
         return build_paper_network(config)
+    if isinstance(config, SemanticConfig):
+        from rtmap_models.semantic.network import SemanticNet
+
+        return SemanticNet(config)
     from rtmap_models.tiny.network import RTMapNet
 
     assert isinstance(config, TinyConfig)

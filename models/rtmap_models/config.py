@@ -9,9 +9,13 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 from rtmap_cli.errors import BadInput
+from rtmap_cli.logs.semantic import CLASSES, EVIDENCE
 from rtmap_cli.maps.element import RING_CLASSES
 
 CONFIGS = Path(__file__).parent / "configs"
+
+WINDOW_MARGIN_M = (6.0, 8.0)
+"""How much a kept picture is wider than the range (x, y), so that it can be turned and shifted."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,16 @@ class ModelConfig:
     def needs_images(self) -> bool:
         """Whether training needs the cameras' images (else bird's-eye pictures are enough)."""
         return False
+
+    @property
+    def channels(self) -> int:
+        """Planes of the picture that training frames hold."""
+        return 4
+
+    @property
+    def margin_m(self) -> tuple[float, float]:
+        """How much the kept picture is wider than the range on each side, x and y."""
+        return WINDOW_MARGIN_M
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as stored in checkpoints."""
@@ -92,14 +106,57 @@ class TinyConfig(ModelConfig):
 
     def check(self) -> str | None:
         """What is wrong with the values, if anything."""
-        if any(size % 16 for size in self.picture_size):
-            return "the picture must have multiples of 16 cells: change cell_m"
+        if any(size % 8 for size in self.picture_size):
+            return "the picture must have multiples of 8 cells: change cell_m"
         if self.image_width < 0 or self.tilt_sigma < 0:
             return "image_width and tilt_sigma must not be negative"
         if (self.image_width > 0) != bool(self.image_heights_m or self.tilt_sigma):
             return "image_width goes with image_heights_m, tilt_sigma or both"
         if self.needs_images and any(size % 8 for size in self.image_size):
             return "image_size must be multiples of 8"
+        return super().check()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SemanticConfig(TinyConfig):
+    """The vectoriser of semantic rasters; see ``configs/semantic-tiny.toml``.
+
+    ``planes`` are those of a raster in their order, ``raster_cell_m`` its cell and
+    ``raster_half_m`` half its extent in x and y. There is no camera: what describes one is idle.
+    """
+
+    image_size: tuple[int, int] = (1, 1)
+    horizon: float = 0.0
+    supersample: int = 1
+    planes: tuple[str, ...] = (*CLASSES, EVIDENCE)
+    raster_cell_m: float = 0.2
+    raster_half_m: tuple[float, float] = (36.0, 18.0)
+
+    @property
+    def channels(self) -> int:
+        """One per plane of the raster."""
+        return len(self.planes)
+
+    @property
+    def margin_m(self) -> tuple[float, float]:
+        """What the raster shows beyond the range."""
+        (x, y), (half_x, half_y) = self.raster_half_m, self.half_range
+        return x - half_x, y - half_y
+
+    @property
+    def raster_size(self) -> tuple[int, int]:
+        """Rows (y) and columns (x) of a raster."""
+        x, y = (2 * half / self.raster_cell_m for half in self.raster_half_m)
+        return round(y), round(x)
+
+    def check(self) -> str | None:
+        """What is wrong with the values, if anything."""
+        if self.image_width:
+            return "a semantic network reads no images: image_width must be 0"
+        if self.raster_cell_m <= 0 or len(set(self.planes)) != len(self.planes):
+            return "raster_cell_m must be above 0 and planes must differ"
+        if min(self.margin_m) < 0 or any(abs(m / self.cell_m % 1) > 1e-6 for m in self.margin_m):
+            return "raster_half_m must exceed the range by whole cells (cell_m)"
         return super().check()
 
 
@@ -187,7 +244,11 @@ class PaperConfig(ModelConfig):
         return super().check()
 
 
-KINDS: dict[str, type[ModelConfig]] = {"tiny": TinyConfig, "paper": PaperConfig}
+KINDS: dict[str, type[ModelConfig]] = {
+    "tiny": TinyConfig,
+    "semantic": SemanticConfig,
+    "paper": PaperConfig,
+}
 
 
 def config_from_dict(values: dict[str, Any], where: str | Path = "configuration") -> ModelConfig:
@@ -200,7 +261,7 @@ def config_from_dict(values: dict[str, Any], where: str | Path = "configuration"
     known = {f.name: f for f in fields(kind)}
     needed = {k for k, f in known.items() if f.default is MISSING}
     if odd := sorted((set(values) - set(known)) | (needed - set(values))):
-        like = "rtmap-tiny.toml" if kind is TinyConfig else "rtmap-r50.toml"
+        like = "rtmap-r50.toml" if kind is PaperConfig else "rtmap-tiny.toml"
         raise BadInput(where, f"missing or unknown keys: {', '.join(odd)}", f"see {like}")
     plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     hints = get_type_hints(kind)

@@ -52,6 +52,11 @@ from rtmap_cli.output import emit, log, progress
     show_default=True,
     help="Ask again with the prior at the pose found: for starts of 2 m and more.",
 )
+@click.option(
+    "--semantic",
+    type=options.PATH,
+    help="The semantic rasters of LOG, for a model that reads them [default: LOG/semantic].",
+)
 @click.option("--skip-bad-frames", is_flag=True, help="Leave out unreadable frames, count them.")
 @options.threads
 @options.overwrite
@@ -70,6 +75,7 @@ def command(
     every: int,
     level: bool,
     looks: int,
+    semantic: Path | None,
     skip_bad_frames: bool,
     threads: int | None,
     overwrite: bool,
@@ -86,10 +92,12 @@ def command(
     \b
     Example:
       rtmap infer logs/monday --map map -o runs/monday
+      rtmap infer logs/cart --model semantic-tiny -o runs/cart
     """  # fmt: skip
     import os
     import time
 
+    from rtmap_cli.errors import UsageError
     from rtmap_cli.logs.agreement import warning
     from rtmap_cli.logs.open import notes_of, open_log
     from rtmap_cli.logs.run import STATES, write_run
@@ -119,7 +127,10 @@ def command(
         every=every,
         level=level,
         looks=looks,
+        semantic=semantic,
     )
+    if semantic is not None and network.info.raster is None:
+        raise UsageError(f"--semantic: {network.info.name} reads images, not rasters")
     started = time.perf_counter()
     total = min(-(-len(source) // every), max_frames or len(source))
     with whole_folder(output, overwrite) as folder:

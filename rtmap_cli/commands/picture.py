@@ -61,7 +61,7 @@ def command(
     Example:
       rtmap picture logs/monday --frame 3 --grid -o grid.png
     """
-    from rtmap_cli.errors import BadInput
+    from rtmap_cli.errors import BadInput, UsageError
     from rtmap_cli.logs.open import notes_of, open_log
     from rtmap_cli.maps.crop import DEFAULT_RANGE
     from rtmap_cli.maps.store import read_map
@@ -80,6 +80,8 @@ def command(
         log(f"{source.log_id}: {note}")
     frame = _frame(source, number)
     model = MapModel(as_seen).info if as_seen else None
+    if model is not None and model.raster is not None:
+        raise UsageError(f"--as-seen: {model.name} reads rasters, see overview.png beside them")
     vector_map = read_map(map_path, map_version) if map_path is not None else None
     road = RoadUnder([f.map_SE3_ego for f in source.frames()], vector_map)
     views = _views(source, frame, road.plane(frame.map_SE3_ego), model, width)

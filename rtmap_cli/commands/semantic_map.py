@@ -105,6 +105,7 @@ def command(
     \b
     Example:
       rtmap semantic-map logs/monday -o semantic/monday
+      rtmap semantic-map logs/monday -o logs/monday/semantic
       rtmap semantic-map logs/monday --segmenter seg.onnx --labels mapillary.json -o semantic/monday
     """  # fmt: skip
     from rtmap_cli.errors import UsageError
@@ -114,7 +115,10 @@ def command(
 
     if chosen["masks"] and chosen["segmenter"]:
         raise UsageError("--masks and --segmenter: give one of them")
-    given = [folder_of(log_path)]
+    log_folder = folder_of(log_path)
+    # A log may carry its rasters; it is not touched otherwise.
+    carried = output.resolve() == (log_folder / "semantic").resolve()
+    given = [] if carried else [log_folder]
     given += [p for k in ("masks", "segmenter", "poses") if (p := chosen[k]) is not None]
     refuse_over(output, *given)
     refuse_existing(output, overwrite)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,9 @@ NEEDS = "training needs the extra 'train': pip install 'rtmap[train,simulate]'"
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @options.output("The weights, e.g. weights.pt; the losses go to a .csv file beside it.")
-@click.option("--config", default="rtmap-tiny", show_default=True, help="Name or .toml file.")
+@click.option(
+    "--config", help="Name or .toml file [default: that of --init or --resume, else rtmap-tiny]."
+)
 @click.option(
     "--data",
     multiple=True,
@@ -44,6 +47,13 @@ NEEDS = "training needs the extra 'train': pip install 'rtmap[train,simulate]'"
     "--frames",
     type=click.IntRange(1),
     help="Render procedural towns until the first --data folder holds this many frames.",
+)
+@click.option(
+    "--domain",
+    type=click.Choice(["city", "campus"]),
+    default="campus",
+    show_default=True,
+    help="Kind of towns and vehicle that --frames simulates for a network of semantic rasters.",
 )
 @click.option("--keep-images", is_flag=True, help="Keep camera images with the frames.")
 @click.option("--live", is_flag=True, help="Go on rendering new towns while training.")
@@ -73,7 +83,7 @@ NEEDS = "training needs the extra 'train': pip install 'rtmap[train,simulate]'"
 @options.threads
 @options.quiet
 @options.overwrite
-def command(output: Path, config: str, **given: Any) -> int:
+def command(output: Path, config: str | None, **given: Any) -> int:
     """Train a network on real logs, on procedural towns, or on both.
 
     Renders frames with --frames (kept in --data), turns logs into frames once (kept in --cache),
@@ -86,12 +96,15 @@ def command(output: Path, config: str, **given: Any) -> int:
     """
     _check(output, given)
     try:
-        from rtmap_models.config import load_config
+        from rtmap_models.training.checkpoint import config_to_train
         from rtmap_models.training.distributed import torchrun
     except ModuleNotFoundError as error:
         raise UsageError(f"{NEEDS} ({error.name} is missing)") from None
     with torchrun(given["device"]) as group:
-        return _run(load_config(config), config, output, given, group)
+        resumed = given["resume"] and str(given["resume"])
+        first = given["init"] if not given["init_partial"] else None
+        sizes = config_to_train(config, resumed or first)
+        return _run(sizes, config or sizes.name, output, given, group)
 
 
 def _check(output: Path, given: dict[str, Any]) -> None:
@@ -134,6 +147,8 @@ def _run(sizes: Any, config: str, output: Path, given: dict[str, Any], group: An
     def make() -> tuple[tuple[Path, ...], tuple[Path, ...]]:
         return _make_frames(sizes, output, given, workers)
 
+    if given["live"] and sizes.architecture == "semantic":
+        raise UsageError("--live renders cameras: give a network of semantic rasters its --frames")
     data, unseen = make() if group is None else group.first(make)
     if given["steps"] is None and given["minutes"] is None:
         return 0
@@ -160,6 +175,28 @@ def _run(sizes: Any, config: str, output: Path, given: dict[str, Any], group: An
     return 130 if result["signal"] else 0
 
 
+def _render(
+    sizes: Any,
+    folder: Path,
+    given: dict[str, Any],
+    workers: int,
+    report: Callable[[str], None],
+    keep: bool | None,
+) -> None:
+    """Simulated frames of a network's kind: pictures of cameras, or semantic rasters."""
+    from rtmap_models.config import SemanticConfig
+
+    count, seed = given["frames"], given["seed"]
+    if isinstance(sizes, SemanticConfig):
+        from rtmap_models.semantic.frames import generate_drives
+
+        generate_drives(sizes, given["domain"], folder, count, seed, workers, report)
+        return
+    from rtmap_models.data.generate import generate
+
+    generate(sizes, folder, count, seed, workers, report, keep_images=keep)
+
+
 def _make_frames(
     sizes: Any, output: Path, given: dict[str, Any], workers: int
 ) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
@@ -177,10 +214,7 @@ def _make_frames(
         towns = places[0] if places else output.parent / "frames"
         data = [str(towns), *(d for d in data if Path(d) != towns)]
         if given["frames"] is not None:
-            from rtmap_models.data.generate import generate
-
-            count, seed = given["frames"], given["seed"]
-            generate(sizes, towns, count, seed, workers, report, keep_images=keep)
+            _render(sizes, towns, given, workers, report, keep)
     cache = given["cache"] or output.parent / "cache"
     unseen = [given["validate"]] if given["validate"] is not None else []
     train, held_out = (

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rtmap_models.config import ModelConfig
+from rtmap_models.config import ModelConfig, SemanticConfig
 from rtmap_models.data.samples import (
     Array,
     Pieces,
@@ -72,7 +72,7 @@ class Augmentation:
 
 @dataclass
 class Sample:
-    """One frame ready for a batch. ``picture`` uint8 (H, W, 4); ``scene`` the elements also
+    """One frame ready for a batch. ``picture`` uint8 (H, W, K); ``scene`` the elements also
     outside the range; see `Batch` for the rest."""
 
     picture: NDArray[np.uint8]
@@ -91,7 +91,7 @@ class Sample:
 class Batch:
     """B samples; G truth elements of all samples one after the other; P prior slots."""
 
-    picture: Tensor  # (B, 4, H, W) float 0 … 255
+    picture: Tensor  # (B, K, H, W) float 0 … 255
     prior_points: Tensor  # (B, P, V, 2)
     prior_class: Tensor  # (B, P) int64
     prior_mask: Tensor  # (B, P) 1 = used
@@ -166,7 +166,13 @@ def _moved_picture(
     warp = np.column_stack([inverse, offset])
     rows, columns = config.picture_size
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(picture, warp, (columns, rows), flags=flags), np.uint8)
+    parts = [
+        cv2.warpAffine(
+            np.ascontiguousarray(picture[..., k : k + 4]), warp, (columns, rows), flags=flags
+        )
+        for k in range(0, picture.shape[2], 4)  # OpenCV takes four channels at a time
+    ]
+    return np.concatenate([p.reshape(rows, columns, -1) for p in parts], axis=2).astype(np.uint8)
 
 
 def _moved_cameras(
@@ -286,12 +292,13 @@ def collate(samples: list[Sample], config: ModelConfig) -> Batch:
     picture = torch.from_numpy(np.stack([s.picture for s in samples])).permute(0, 3, 1, 2).float()
     gain = torch.from_numpy(np.stack([s.gain for s in samples])).float()[..., None, None]
     offset = torch.from_numpy(np.stack([s.offset for s in samples])).float()[..., None, None]
-    colour = (picture[:, :3] - 110) * gain + 110 + offset
+    if not isinstance(config, SemanticConfig):  # classes have no colour to vary
+        picture = torch.cat([(picture[:, :3] - 110) * gain + 110 + offset, picture[:, 3:]], dim=1)
     images, ego_to_image = _stacked_cameras(samples)
     planes = [np.full(3, np.nan) if s.plane is None else s.plane for s in samples]
     tensor = torch.from_numpy
     return Batch(
-        picture=torch.cat([colour, picture[:, 3:]], dim=1),
+        picture=picture,
         prior_points=tensor(points),
         prior_class=tensor(class_id),
         prior_mask=tensor(mask),

@@ -2,8 +2,9 @@
 
 A folder holds shards; a shard is a few files that appear whole:
 
-``NAME.npy``         uint8 (n, rows, columns, 4) bird's-eye pictures, wider than the range so that
-                     they can be turned and shifted
+``NAME.npy``         uint8 (n, rows, columns, K) bird's-eye pictures, wider than the range so that
+                     they can be turned and shifted: K = 4 colours and quality of cameras, or the
+                     planes of a semantic raster
 ``NAME.images.npy``  uint8 (n, N, H, W, 3) camera images (optional; networks that look at them)
 ``NAME.npz``         the elements of each frame; with images, their projections (n, N, 3, 4) and the
                      road's plane in them (n, 3), NaN where unknown
@@ -27,9 +28,6 @@ from rtmap_cli.tables import whole_file
 from rtmap_models.config import ModelConfig
 from rtmap_models.data.samples import Array, Scene
 
-WINDOW_MARGIN_M = (6.0, 8.0)
-"""How much the cached picture is wider than the range on each side, x and y."""
-
 SCENE_MARGIN_M = 14.0
 """Elements are kept this far outside the range, for augmentation."""
 
@@ -37,7 +35,7 @@ SCENE_MARGIN_M = 14.0
 class Frame(NamedTuple):
     """One training frame.
 
-    ``picture`` uint8 (rows, columns, 4), the wide bird's-eye picture; ``scene`` the elements around
+    ``picture`` uint8 (rows, columns, K), the wide bird's-eye picture; ``scene`` the elements around
     the vehicle; ``images`` uint8 (N, H, W, 3) and ``ego_to_image`` float32 (N, 3, 4) where kept: an
     absent camera is zero in both; ``plane`` (3,) the road z = a x + b y + c in the frame that they
     project from, where known: what levelling left.
@@ -53,7 +51,7 @@ class Frame(NamedTuple):
 def window_half(config: ModelConfig) -> tuple[float, float]:
     """Half extent of the cached picture, metres."""
     half_x, half_y = config.half_range
-    return half_x + WINDOW_MARGIN_M[0], half_y + WINDOW_MARGIN_M[1]
+    return half_x + config.margin_m[0], half_y + config.margin_m[1]
 
 
 def window_size(config: ModelConfig) -> tuple[int, int]:
@@ -65,7 +63,7 @@ def window_size(config: ModelConfig) -> tuple[int, int]:
 def crop_window(picture: NDArray[np.uint8], config: ModelConfig) -> NDArray[np.uint8]:
     """The range itself, out of the wider cached picture."""
     rows, columns = config.picture_size
-    top, left = (round(m / config.cell_m) for m in (WINDOW_MARGIN_M[1], WINDOW_MARGIN_M[0]))
+    top, left = (round(m / config.cell_m) for m in config.margin_m[::-1])
     return picture[top : top + rows, left : left + columns]
 
 
@@ -127,8 +125,9 @@ class _Shard:
 
     def _check(self, config: ModelConfig) -> None:
         size = window_size(config)
-        if self.pictures.shape[1:] != (*size, 4):
-            what = f"pictures of {self.pictures.shape[1:3]}, the configuration needs {size}"
+        if self.pictures.shape[1:] != (*size, config.channels):
+            needed = (*size, config.channels)
+            what = f"pictures of {self.pictures.shape[1:]}, the configuration needs {needed}"
             raise BadInput(self.path, what, "use another --data folder")
         if self.table["classes"].max(initial=0) >= len(config.classes):
             raise BadInput(self.path, "classes that the configuration lacks", "use other data")

@@ -32,7 +32,7 @@ from rtmap_cli.steps.infer.checks import check_prior_in_range
 from rtmap_cli.steps.infer.images import FittedCamera
 from rtmap_cli.steps.infer.levelling import RoadUnder
 from rtmap_cli.tables import whole_folder
-from rtmap_models.config import ModelConfig
+from rtmap_models.config import ModelConfig, SemanticConfig
 from rtmap_models.data.samples import Array
 from rtmap_models.data.views import Pictures, View, scene_at
 
@@ -145,6 +145,9 @@ def _cache_name(job: LogJob) -> str:
         job.spacing_m,
         None if job.map_path is None else [str(job.map_path.resolve()), version],
     ]
+    if isinstance(config, SemanticConfig):
+        file = place / "semantic" / "semantic.json"
+        what += [config.planes, file.read_text(encoding="utf-8") if file.is_file() else ""]
     digest = hashlib.sha256(json.dumps(what).encode()).hexdigest()[:12]
     return f"{place.resolve().name.replace('#', '-')}-{digest}"
 
@@ -173,7 +176,11 @@ def _make(job: LogJob) -> Outcome:
 def make_frames(job: LogJob) -> int:
     """Turn one log into shards of frames; returns their count."""
     log = open_log(job.spec)
-    truth = _truth(job, log)
+    truth = truth_of_log(job, log)
+    if isinstance(job.config, SemanticConfig):
+        from rtmap_models.semantic.logs import make_raster_frames
+
+        return make_raster_frames(job, log, truth)
     with whole_folder(job.folder) as folder:
         count = 0
         for number, views in enumerate(_chunks(log_views(log, truth, job), SHARD_FRAMES)):
@@ -199,7 +206,7 @@ def log_views(log: Log, truth: VectorMap, job: LogJob) -> Iterator[View]:
     cameras = {
         c.name: FittedCamera(c, config.image_size, config.horizon, log.ground_z) for c in log.rig
     }
-    true = _true_poses(log)
+    true = true_poses(log)
     poses = {f.index: f.map_SE3_ego for f in log.frames()} if true is None else true
     road = RoadUnder(list(poses.values()), truth)
     last: Array | None = None
@@ -230,7 +237,7 @@ def _cameras_of(
     return images, projections
 
 
-def _true_poses(log: Log) -> dict[int, Array] | None:
+def true_poses(log: Log) -> dict[int, Array] | None:
     """Poses that a simulator or a survey laid beside a log, by frame."""
     read = getattr(log, "truth_poses", None)
     poses = read() if read is not None else None
@@ -239,7 +246,7 @@ def _true_poses(log: Log) -> dict[int, Array] | None:
     return {int(k): pose for k, pose in zip(poses.frame, poses.pose, strict=True)}
 
 
-def _truth(job: LogJob, log: Log) -> VectorMap:
+def truth_of_log(job: LogJob, log: Log) -> VectorMap:
     """The map that says what is there, in the log's frame."""
     if job.map_path is not None:
         vector_map = read_map(job.map_path)

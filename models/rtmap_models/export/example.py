@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rtmap_models.config import SemanticConfig
+
 LINES_Y = (-7.0, -3.5, 0.0, 3.5, 7.0)
 """Metres: the rims of the road and the lines between its lanes."""
 
@@ -27,6 +29,8 @@ def example_inputs(
     empty.
     """
     rng = np.random.default_rng(seed)
+    if isinstance(config, SemanticConfig):
+        return _semantic_inputs(config, batch, priors, rng)
     height, width = config.image_size
     images = np.zeros((batch, cameras, height, width, 3), np.uint8)
     projections = np.zeros((batch, cameras, 3, 4), np.float32)
@@ -38,12 +42,55 @@ def example_inputs(
             projections[b, k] = _looking(2 * np.pi * k / cameras, config)
             images[b, k] = _view(projections[b, k], (height, width), heading, aside, rng)
         points[b] = _prior(config, priors, heading, aside, rng)
-        for k in range(min(priors, len(LINES_Y))):
-            outer = k in (0, len(LINES_Y) - 1)
-            class_id[b, k] = _class_of(config, "boundary" if outer else "divider")
+        _name_lines(class_id[b], config)
     mask = (rng.random((batch, priors)) < 0.8).astype(np.float32)
-    arrays = (images, projections, points, class_id, mask)
+    return _tensors(images, projections, points, class_id, mask)
+
+
+def _semantic_inputs(
+    config: SemanticConfig, batch: int, priors: int, rng: np.random.Generator
+) -> tuple[Tensor, ...]:
+    """The same road as a semantic raster: planes of classes, each cell seen in three of four."""
+    rows, columns = config.raster_size
+    half_x, half_y = config.raster_half_m
+    y, x = np.mgrid[0:rows, 0:columns] + 0.5
+    x, y = x * config.raster_cell_m - half_x, y * config.raster_cell_m - half_y
+    raster = np.zeros((batch, config.channels, rows, columns), np.uint8)
+    points = np.zeros((batch, priors, config.vertex_count, 2), np.float32)
+    class_id = rng.integers(0, len(config.classes), (batch, priors))
+    for b in range(batch):
+        heading, aside = rng.normal(0, 0.1), rng.uniform(-3, 3)
+        along, across = _on_road(x, y, heading, aside)
+        kind = np.where(np.abs(across) < LINES_Y[-1], 0, 4)
+        kind[np.min([np.abs(across - line) for line in LINES_Y[1:-1]], axis=0) < 0.15] = 2
+        kind[np.abs(np.abs(across) - LINES_Y[-1]) < 0.15] = 3
+        crossing = (along > CROSSING_X[0]) & (along < CROSSING_X[1])
+        kind[crossing & (np.abs(across) < LINES_Y[-1])] = 1
+        seen = rng.random((rows, columns)) < 0.75
+        for k in range(config.channels - 1):
+            raster[b, k] = seen * np.where(kind == k, 200, 10)
+        raster[b, -1] = seen * rng.integers(20, 255, (rows, columns))
+        points[b] = _prior(config, priors, heading, aside, rng)
+        _name_lines(class_id[b], config)
+    mask = (rng.random((batch, priors)) < 0.8).astype(np.float32)
+    return _tensors(raster, points, class_id, mask)
+
+
+def _tensors(*arrays: Array) -> tuple[Tensor, ...]:
     return tuple(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays)
+
+
+def _name_lines(class_id: Array, config: Any) -> None:
+    """The first slots of a prior are the lines of the road."""
+    for k in range(min(len(class_id), len(LINES_Y))):
+        outer = k in (0, len(LINES_Y) - 1)
+        class_id[k] = _class_of(config, "boundary" if outer else "divider")
+
+
+def _on_road(x: Array, y: Array, heading: float, aside: float) -> tuple[Array, Array]:
+    """Places along and across the road."""
+    y = y - aside
+    return np.cos(heading) * x + np.sin(heading) * y, np.cos(heading) * y - np.sin(heading) * x
 
 
 def _class_of(config: Any, name: str) -> int:
@@ -74,8 +121,8 @@ def _view(
     ray = np.linalg.inv(projection[:, [0, 1, 3]].astype(np.float64))
     x, y, w = ray @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
     ground = w > 1e-4
-    x, y = x / np.where(ground, w, 1), y / np.where(ground, w, 1) - aside
-    x, y = np.cos(heading) * x + np.sin(heading) * y, np.cos(heading) * y - np.sin(heading) * x
+    w = np.where(ground, w, 1)
+    x, y = _on_road(x / w, y / w, heading, aside)
     paint = np.min([np.abs(y - line) for line in LINES_Y], axis=0) < 0.12
     paint |= (x > CROSSING_X[0]) & (x < CROSSING_X[1]) & (np.abs(y) < 7) & (y % 1.0 < 0.5)
     colour = np.where(paint, 220.0, 85.0)[:, None].repeat(3, 1)

@@ -16,6 +16,7 @@ from torch import nn
 
 from rtmap_cli.errors import Findings
 from rtmap_cli.tables import whole_file
+from rtmap_models.config import SemanticConfig
 from rtmap_models.export.borders import pad_with_zeros
 from rtmap_models.export.example import example_inputs
 from rtmap_models.export.half import to_half
@@ -32,6 +33,7 @@ from rtmap_models.export.parity import (
     OUTPUTS,
     SINGLE,
     ParityReport,
+    inputs_of,
     parity,
     parity_report,
 )
@@ -93,14 +95,12 @@ def export_onnx(
 def _trace(network: nn.Module) -> onnx.ModelProto:
     # Traced at sizes above one: a graph traced at 1 claims to be dynamic and fails at 3.
     inputs = example_inputs(network.config, batch=2, cameras=3, priors=4)
+    names = inputs_of(network.config)
     batch, cameras, priors = (torch.export.Dim(name, min=1) for name in ("B", "N", "P"))
-    shapes = {
-        "images": {0: batch, 1: cameras},
-        "ego_to_image": {0: batch, 1: cameras},
-        "prior_points": {0: batch, 1: priors},
-        "prior_class": {0: batch, 1: priors},
-        "prior_mask": {0: batch, 1: priors},
-    }
+    second = {"images": cameras, "ego_to_image": cameras}
+    shapes: dict[str, Any] = {name: {0: batch, 1: second.get(name, priors)} for name in names}
+    if "raster" in shapes:
+        shapes["raster"] = {0: batch}
     for name in ("torch.onnx", "onnxscript"):  # what they miss or skip is no news for a user
         logging.getLogger(name).setLevel(logging.ERROR)
     with torch.no_grad(), warnings.catch_warnings(), lean(network):
@@ -110,7 +110,7 @@ def _trace(network: nn.Module) -> onnx.ModelProto:
             inputs,
             dynamo=True,
             opset_version=OPSET,
-            input_names=list(INPUTS),
+            input_names=list(names),
             output_names=list(OUTPUTS),
             dynamic_shapes=shapes,
             external_data=False,
@@ -212,12 +212,20 @@ def _describe(model: onnx.ModelProto, network: nn.Module, extra: dict[str, Any])
         "prior_slots": config.prior_slots,
         "image_size": list(config.image_size),
         "horizon": config.horizon,
-        "camera_count": "dynamic",
         "sigma": "standard deviation, metres",
         "opset": OPSET,
         "precision": "float16" if half else "float32",
         "parameters": sum(p.numel() for p in network.parameters()),
     } | extra
+    if isinstance(config, SemanticConfig):
+        values["raster"] = {
+            "planes": list(config.planes),
+            "cell_m": config.raster_cell_m,
+            "half_m": list(config.raster_half_m),
+        }
+        del values["image_size"], values["horizon"]
+    else:
+        values["camera_count"] = "dynamic"
     for key, value in values.items():
         _note(model, f"rtmap.{key}", value)
     _note(model, CONFIG_KEY, config.to_dict())

@@ -21,9 +21,11 @@ from scipy.optimize import linear_sum_assignment
 from torch import nn
 
 from rtmap_cli.output import table
+from rtmap_models.config import ModelConfig, SemanticConfig
 from rtmap_models.export.example import example_inputs
 
 INPUTS = ("images", "ego_to_image", "prior_points", "prior_class", "prior_mask")
+RASTER_INPUTS = ("raster", *INPUTS[2:])
 OUTPUTS = ("scores", "points", "sigma", "prior_score", "pose_delta", "pose_covariance")
 
 SIZES = ((1, 7, 9), (3, 5, 1))
@@ -132,6 +134,11 @@ class ParityReport:
         }
 
 
+def inputs_of(config: ModelConfig) -> tuple[str, ...]:
+    """The inputs of the graph of a configuration, in their order."""
+    return RASTER_INPUTS if isinstance(config, SemanticConfig) else INPUTS
+
+
 def parity_report(
     network: nn.Module,
     path: Path,
@@ -142,13 +149,14 @@ def parity_report(
     it, at each size (batch, cameras, prior slots)."""
     rows: list[Row] = []
     notes: list[str] = []
+    assert isinstance(network.config, ModelConfig)
     sure = 0.0 if tolerance.replaced == 0 else SURE
     expected = []
     for seed, size in enumerate(sizes):
         inputs = example_inputs(network.config, *size, seed + 1)
         with torch.no_grad():
             out = [x.cpu().numpy() for x in network(*inputs)]
-        feed = {name: x.numpy() for name, x in zip(INPUTS, inputs, strict=True)}
+        feed = {name: x.numpy() for name, x in zip(inputs_of(network.config), inputs, strict=True)}
         expected.append((size, feed, dict(zip(OUTPUTS, out, strict=True))))
     for provider in onnxruntime.get_available_providers():
         try:

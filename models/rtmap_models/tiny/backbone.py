@@ -39,12 +39,17 @@ class Residual(nn.Module):
         return F.relu(self.second(self.first(x)) + self.shortcut(x))
 
 
-def _double(x: Tensor) -> Tensor:
-    return F.interpolate(x, scale_factor=2.0, mode="nearest")
+def _double(x: Tensor, like: Tensor) -> Tensor:
+    """Twice as many cells per axis; the last ones are cut off where ``like`` has an odd number."""
+    rows, columns = like.shape[2:]
+    out = F.interpolate(x, scale_factor=2.0, mode="nearest")
+    if (rows % 2, columns % 2) != (0, 0):
+        out = out[:, :, :rows, :columns]
+    return out
 
 
 class PictureNet(nn.Module):
-    """Normalised picture (B, 4, H, W) → maps at stride 2 (fine) and stride 4 (coarse)."""
+    """Normalised picture (B, K, H, W) → maps at stride 2 (fine) and stride 4 (coarse)."""
 
     position: Tensor
 
@@ -52,7 +57,7 @@ class PictureNet(nn.Module):
         super().__init__()
         c2, c4, c8, c16 = config.widths
         fine, coarse = config.fine_width, config.coarse_width
-        self.down2 = conv_block(6, c2, 3, 2)
+        self.down2 = conv_block(config.channels + 2, c2, 3, 2)
         self.down4 = nn.Sequential(conv_block(c2, c4, 3, 2), Residual(c4, c4))
         self.down8 = nn.Sequential(Residual(c4, c8, 2), Residual(c8, c8))
         self.down16 = nn.Sequential(Residual(c8, c16, 2), Residual(c16, c16))
@@ -74,9 +79,9 @@ class PictureNet(nn.Module):
         x8 = self.down8(x4)
         x16 = self.down16(x8)
         x16 = F.relu(x16 + self.whole(x16.mean(dim=(2, 3), keepdim=True)))
-        y8 = self.mix8(x8 + _double(self.lift8(x16)))
-        y4 = self.mix4(x4 + _double(self.lift4(y8)))
+        y8 = self.mix8(x8 + _double(self.lift8(x16), x8))
+        y4 = self.mix4(x4 + _double(self.lift4(y8), x4))
         if more is not None:
             y4 = y4 + more.to(y4.dtype)
-        y2 = self.mix2(self.side2(x2) + _double(self.lift2(y4)))
+        y2 = self.mix2(self.side2(x2) + _double(self.lift2(y4), x2))
         return y2, y4

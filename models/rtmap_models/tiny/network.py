@@ -1,4 +1,8 @@
-"""The whole network, top to bottom: cameras → picture → maps → hybrid queries → answer."""
+"""The whole network, top to bottom: cameras → picture → maps → hybrid queries → answer.
+
+What follows the picture is shared by all networks of this kind (`PictureElements`): one decoder,
+whatever made the picture.
+"""
 
 from __future__ import annotations
 
@@ -28,15 +32,13 @@ if TYPE_CHECKING:
     from rtmap_models.data.dataset import Batch
 
 
-class RTMapNet(AnsweringNet):
-    """Images and prior in, elements, existence and pose out."""
+class PictureElements(AnsweringNet):
+    """From a normalised picture and a prior to elements, existence and pose."""
 
     config: TinyConfig
 
     def __init__(self, config: TinyConfig):
         super().__init__(config)
-        self.image_branch = ImageBranch(config) if config.needs_images else None
-        self.warp = BevWarp(*config.half_range, *config.picture_size, config.supersample)
         self.picture_net = PictureNet(config)
         self.segment = nn.Conv2d(config.fine_width, len(config.classes), 1)
         nn.init.constant_(self.segment.bias, -2.0)
@@ -54,7 +56,7 @@ class RTMapNet(AnsweringNet):
         prior_visible: Tensor | None = None,
         lifted: Tensor | None = None,
     ) -> Prediction:
-        """From a normalised picture (B, 4, H, W) and a prior; all layers, for the losses.
+        """From a normalised picture (B, K, H, W) and a prior; all layers, for the losses.
 
         ``prior_visible`` (B,) 0 hides the prior from the new queries (default: visible). ``lifted``
         is what an image branch adds to the coarse map.
@@ -72,6 +74,23 @@ class RTMapNet(AnsweringNet):
         looked = torch.cat([drawn[:, :, None], field], dim=2).detach().flatten(1, 2)
         layers = self.decoder(queries, fine, coarse, looked, bias)
         return Prediction(layers, dense, drawn, field, count)
+
+    def losses(self, batch: Batch, bf16: bool = False) -> dict[str, Tensor]:
+        """The weighted parts of the loss by name; their sum is the loss."""
+        return compute_losses(self.predict_batch(batch, bf16), batch, LossWeights())
+
+    def predict_batch(self, batch: Batch, bf16: bool = False) -> Prediction:
+        """All layers on a training batch; convolutions in bfloat16 where that is asked for."""
+        raise NotImplementedError
+
+
+class RTMapNet(PictureElements):
+    """Images and prior in, elements, existence and pose out."""
+
+    def __init__(self, config: TinyConfig):
+        super().__init__(config)
+        self.image_branch = ImageBranch(config) if config.needs_images else None
+        self.warp = BevWarp(*config.half_range, *config.picture_size, config.supersample)
 
     def forward(
         self,
@@ -110,7 +129,3 @@ class RTMapNet(AnsweringNet):
     def _warped(self, images: Tensor, ego_to_image: Tensor) -> Tensor:
         """The normalised picture, as from disk: in whole numbers."""
         return normalize_picture(self.warp(images, ego_to_image).round())
-
-    def losses(self, batch: Batch, bf16: bool = False) -> dict[str, Tensor]:
-        """The weighted parts of the loss by name; their sum is the loss."""
-        return compute_losses(self.predict_batch(batch, bf16), batch, LossWeights())

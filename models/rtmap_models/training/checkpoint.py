@@ -15,7 +15,7 @@ from rtmap_cli.formats.model_file import find_model
 from rtmap_cli.maps.footprint import METADATA_KEY, Footprint, read_footprint
 from rtmap_cli.tables import whole_file
 from rtmap_models.architecture import build_network
-from rtmap_models.config import ModelConfig, config_from_dict
+from rtmap_models.config import ModelConfig, config_from_dict, load_config
 from rtmap_models.tensors import read_tensors
 
 FORMAT = "rtmap.weights/1"
@@ -75,6 +75,8 @@ def start_from(network: nn.Module, source: str, partial: bool = False) -> list[s
     ``partial`` what differs keeps its fresh value, and its names are returned.
     """
     state = _read_state(_weights_file(source))
+    if partial and (adopt := getattr(network, "adopt", None)) is not None:
+        state = adopt(state)
     own = network.state_dict()
     fitting = {k: v for k, v in state.items() if k in own and v.shape == own[k].shape}
     odd = sorted((own.keys() | state.keys()) - fitting.keys())
@@ -88,6 +90,22 @@ def start_from(network: nn.Module, source: str, partial: bool = False) -> list[s
         raise BadInput(source, "none of its tensors fits this configuration")
     network.load_state_dict(fitting, strict=False)
     return [name for name in odd if name in own]
+
+
+def config_to_train(named: str | Path | None, source: str | None) -> ModelConfig:
+    """The configuration of that name or file, else that of the weights ``source`` to start from
+    (see `start_from`), else the default one."""
+    if named is not None or source is None:
+        return load_config(named or "rtmap-tiny")
+    path = _weights_file(source)
+    if path.suffix != ".onnx":
+        return load_checkpoint(path)[0]
+    from rtmap_models.export.onnx_weights import read_configuration
+
+    values = read_configuration(path)
+    if values is None:
+        raise BadInput(path, "does not say its configuration", "name it with --config")
+    return config_from_dict(values, path)
 
 
 def _misfit(name: str, state: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> str:

@@ -13,7 +13,9 @@ import numpy as np
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.maps.crop import Range
+from rtmap_cli.maps.element import CLASSES
 from rtmap_cli.maps.footprint import METADATA_KEY, NOTHING_KNOWN, Footprint, read_footprint
+from rtmap_cli.steps.infer.rasters import RasterSpec
 
 EXPORT_IT = "export it with rtmap export-model (docs/model-contract.md)"
 
@@ -25,6 +27,9 @@ MEANINGS = {
 }
 """Metadata with one allowed value: everything behind the model counts on it."""
 
+
+RASTER_KEY = "rtmap.raster"
+"""Metadata of a model that reads semantic rasters: their planes, cell and half extent."""
 
 SCORE_SLACK = 1e-3
 """What rounding may carry scores beyond 0 … 1."""
@@ -48,14 +53,19 @@ class ModelInfo:
     image_size: tuple[int, int]
     horizon: float
     footprint: Footprint = NOTHING_KNOWN
+    raster: RasterSpec | None = None  # what it reads in place of images
 
 
 def inputs_of(info: ModelInfo) -> dict[str, tuple[str, tuple[Axis, ...]]]:
     """Element type and shape of every input; letters are dynamic axes."""
     height, width = info.image_size
-    return {
+    seen: dict[str, tuple[str, tuple[Axis, ...]]] = {
         "images": (UINT8, ("B", "N", height, width, 3)),
         "ego_to_image": (FLOAT, ("B", "N", 3, 4)),
+    }
+    if info.raster is not None:
+        seen = {"raster": (UINT8, ("B", *info.raster.shape))}
+    return seen | {
         "prior_points": (FLOAT, ("B", "P", info.vertex_count, 2)),
         "prior_class": (INT64, ("B", "P")),
         "prior_mask": (FLOAT, ("B", "P")),
@@ -93,6 +103,7 @@ def read_metadata(path: Path, metadata: Mapping[str, str], sha256: str) -> Model
             raise BadInput(path, f"{key} is {metadata[key]!r}, not {meaning!r}", EXPORT_IT)
     try:
         box = json.loads(need("rtmap.range_m"))
+        raster = _raster(json.loads(metadata.get(RASTER_KEY, "null")))
         info = ModelInfo(
             name=need("rtmap.model_name"),
             sha256=sha256,
@@ -100,14 +111,27 @@ def read_metadata(path: Path, metadata: Mapping[str, str], sha256: str) -> Model
             range_m=(box["x"][0], box["y"][0], box["x"][1], box["y"][1]),
             vertex_count=whole("rtmap.vertex_count", 2),
             prior_slots=whole("rtmap.prior_slots", 1),
-            image_size=_pair(json.loads(need("rtmap.image_size"))),
-            horizon=float(need("rtmap.horizon")),
+            image_size=_pair(json.loads(need("rtmap.image_size"))) if raster is None else (1, 1),
+            horizon=float(need("rtmap.horizon")) if raster is None else 0.0,
             footprint=read_footprint(json.loads(metadata.get(METADATA_KEY, "null"))),
+            raster=raster,
         )
         _sensible(info)
     except (ValueError, TypeError, KeyError, IndexError) as error:
         raise BadInput(path, f"the model's metadata make no sense ({error})", EXPORT_IT) from None
     return info
+
+
+def _raster(values: Any) -> RasterSpec | None:
+    if values is None:
+        return None
+    half_x, half_y = values["half_m"]
+    spec = RasterSpec(
+        tuple(str(p) for p in values["planes"]), float(values["cell_m"]), half_x, half_y
+    )
+    if min(spec.cell, half_x, half_y) <= 0 or len(set(spec.planes)) != len(spec.planes):
+        raise ValueError(f"{RASTER_KEY} is {values}")
+    return spec
 
 
 def _pair(values: Any) -> tuple[int, int]:
@@ -119,6 +143,8 @@ def _sensible(info: ModelInfo) -> None:
     x0, y0, x1, y1 = (float(v) for v in info.range_m)
     if not all(map(math.isfinite, (x0, y0, x1, y1))) or x0 >= x1 or y0 >= y1:
         raise ValueError(f"rtmap.range_m spans {x0:g} … {x1:g} by {y0:g} … {y1:g} m")
+    if info.raster is not None and (unknown := sorted(set(info.classes) - set(CLASSES))):
+        raise ValueError(f"rtmap.classes has {unknown[0]}, maps have {', '.join(CLASSES)}")
     if not info.classes or len(set(info.classes)) != len(info.classes):
         raise ValueError(f"rtmap.classes are {', '.join(info.classes) or 'none'}")
     if min(info.image_size) < 1 or not 0 <= info.horizon <= 1:

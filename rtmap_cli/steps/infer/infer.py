@@ -6,10 +6,11 @@ time, each on one thread, which keeps all cores busier than one frame on all of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput, NoAnswer
-from rtmap_cli.geometry.cameras import levelled
 from rtmap_cli.geometry.poses import se3_from_xyyaw, wrap_angle, xyyaw_of, yaw_of
 from rtmap_cli.logs.log import Frame, Log
 from rtmap_cli.logs.run import (
@@ -35,8 +35,7 @@ from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.prior import PriorSlots, on_prior, prior_slots
 from rtmap_cli.steps.infer.ahead import in_order
 from rtmap_cli.steps.infer.duplicates import fade_duplicates
-from rtmap_cli.steps.infer.images import FittedCamera
-from rtmap_cli.steps.infer.levelling import RoadUnder
+from rtmap_cli.steps.infer.loading import Loaded, Source, source_of
 from rtmap_cli.steps.infer.model import MapModel
 
 Array = NDArray[np.float64]
@@ -51,7 +50,8 @@ class InferOptions:
     ``skip_bad_frames``: leave out frames that cannot be read and count them;
     ``max_frames``: stop after so many; ``every``: take every n-th frame; ``level``: turn the
     cameras to how the road lies (`RoadUnder`); ``looks``: how often the network is asked, each time
-    with the prior cropped at the pose that the time before gave."""
+    with the prior cropped at the pose that the time before gave; ``semantic``: the folder of the
+    log's rasters, for a network that reads them (default: ``semantic`` in the log)."""
 
     score_threshold: float = 0.05
     existence_threshold: float = 0.5
@@ -62,17 +62,11 @@ class InferOptions:
     every: int = 1
     level: bool = True
     looks: int = 1
+    semantic: Path | None = None
 
 
 FAR_SIGMAS = 4.0
 """A pose further than this from the initial one is not trusted with another look."""
-
-
-@dataclass(frozen=True)
-class _Loaded:
-    frame: Frame
-    images: NDArray[np.uint8]
-    ego_to_image: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -104,20 +98,14 @@ def infer_log(
     ``prior_points`` (D) and state matched or outdated, the other queries give state new.
     Raises BadInput for unreadable frames (unless skipped) and NoAnswer when no frame is left.
     """
-    if log.rig is None:
-        raise BadInput(log.path, "the log has no camera calibration", "infer needs one")
     index = MapIndex(prior) if prior is not None else None
-    cameras = {
-        camera.name: FittedCamera(camera, model.info.image_size, model.info.horizon, log.ground_z)
-        for camera in log.rig
-    }
-    road = RoadUnder([f.map_SE3_ego for f in log.frames()], prior) if options.level else None
+    source = source_of(log, model.info, prior, options.level, options.semantic)
     answers: list[_Answer] = []
     skipped = 0
     pool = ThreadPoolExecutor(options.threads)
     try:
         # In the pool's queue work stands in the order in which it is wanted.
-        load = partial(_load, cameras=cameras, road=road, skip=options.skip_bad_frames)
+        load = partial(_load, source=source, skip=options.skip_bad_frames)
         loaded = in_order(load, _chosen(log, options), pool, 2 * options.threads + options.batch)
         answer = partial(_answers, model=model, index=index, options=options)
         batches = _batches(progress(loaded), options.batch)
@@ -139,7 +127,7 @@ def infer_log(
             f"{dropped} prior elements found no slot (the model has {model.info.prior_slots}): in "
             "each frame the nearest were asked about"
         )
-    _say_missing(cameras, rows, say)
+    _say_missing(source.cameras, rows, say)
     info = run_info(
         log.log_id,
         log.crs,
@@ -151,7 +139,7 @@ def infer_log(
         model=model.info.name,
         model_sha256=model.info.sha256,
         model_footprint=model.info.footprint.as_json(),
-        options={k: v for k, v in asdict(options).items() if k != "threads"},
+        options=_said(options),
         frames=len(rows),
         skipped_frames=skipped,
         prior_elements_without_slot=dropped,
@@ -162,8 +150,15 @@ def infer_log(
     return Run(info, _frames(rows), observations, _occluders(rows))
 
 
+def _said(options: InferOptions) -> dict[str, Any]:
+    """The options that an answer depends on."""
+    said = {k: v for k, v in asdict(options).items() if k != "threads"}
+    folder = said.pop("semantic")
+    return said if folder is None else said | {"semantic": str(folder)}
+
+
 def _say_missing(
-    cameras: dict[str, FittedCamera],
+    cameras: Sequence[str],
     rows: list[tuple[Frame, int, Array, Array]],
     say: Callable[[str], None],
 ) -> None:
@@ -185,32 +180,22 @@ def _chosen(log: Log, options: InferOptions) -> Iterator[Frame]:
         yield frame
 
 
-def _load(
-    frame: Frame, cameras: dict[str, FittedCamera], road: RoadUnder | None, skip: bool
-) -> _Loaded | BadInput:
+def _load(frame: Frame, source: Source, skip: bool) -> Loaded | BadInput:
     """What the network is given of a frame; with ``skip`` an error is returned, not raised."""
     try:
-        names = [name for name in cameras if name in frame.images]
-        if not names:
-            todo = "simulate them (rtmap simulate images) or skip"
-            raise BadInput(f"frame {frame.index}", "has no images", todo)
-        images = np.stack([cameras[name].load(frame.images[name]) for name in names])
-        matrices = np.stack([cameras[name].at(frame.ego_SE3_exposure.get(name)) for name in names])
+        return source.load(frame)
     except BadInput as error:
         if not skip:
             raise
         return error
-    if road is not None:
-        matrices = levelled(matrices, road.plane(frame.map_SE3_ego)).astype(np.float32)
-    return _Loaded(frame, images, matrices)
 
 
-def _batches(items: Iterable[_Loaded | BadInput], size: int) -> Iterator[list[_Loaded | BadInput]]:
+def _batches(items: Iterable[Loaded | BadInput], size: int) -> Iterator[list[Loaded | BadInput]]:
     """Consecutive frames with the same number of cameras, at most ``size`` of them."""
-    batch: list[_Loaded | BadInput] = []
+    batch: list[Loaded | BadInput] = []
     count = -1
     for item in items:
-        n = len(item.images) if isinstance(item, _Loaded) else count
+        n = item.cameras if isinstance(item, Loaded) else count
         if batch and (n != count or len(batch) == size):
             yield batch
             batch = []
@@ -221,13 +206,13 @@ def _batches(items: Iterable[_Loaded | BadInput], size: int) -> Iterator[list[_L
 
 
 def _answers(
-    batch: list[_Loaded | BadInput],
+    batch: list[Loaded | BadInput],
     model: MapModel,
     index: MapIndex | None,
     options: InferOptions,
 ) -> list[_Answer | BadInput]:
     """What the network says of each frame of a batch, errors of frames in their places."""
-    good = [item for item in batch if isinstance(item, _Loaded)]
+    good = [item for item in batch if isinstance(item, Loaded)]
     if not good:
         return [item for item in batch if isinstance(item, BadInput)]
     poses, slots, out = _look(model, index, good, options.looks)
@@ -239,14 +224,14 @@ def _answers(
             continue
         seen = _observations(model, out, k, item.frame.index, slots[k], options)
         pose, covariance = _end_to_end(poses[k], out, k, len(slots[k]))
-        about = (item.frame, len(item.images))
+        about = (item.frame, item.cameras)
         answers.append(_Answer(*about, seen, pose, covariance, slots[k].dropped))
         k += 1
     return answers
 
 
 def _look(
-    model: MapModel, index: MapIndex | None, batch: list[_Loaded], looks: int
+    model: MapModel, index: MapIndex | None, batch: list[Loaded], looks: int
 ) -> tuple[list[Array], list[PriorSlots], dict[str, Any]]:
     """Ask the network ``looks`` times. Returns the poses that the prior was cropped at in the end
     (map_SE3_ego, (4, 4) each), the prior's slots and the answer."""
@@ -281,7 +266,7 @@ def _slots(index: MapIndex | None, pose: Array, model: MapModel) -> PriorSlots:
     return prior_slots(local, pose, info.classes, info.vertex_count, info.prior_slots)
 
 
-def _call(model: MapModel, batch: list[_Loaded], slots: list[PriorSlots]) -> dict[str, Any]:
+def _call(model: MapModel, batch: list[Loaded], slots: list[PriorSlots]) -> dict[str, Any]:
     """One call of the network; slots are padded with zeros to the fullest frame (at least 1)."""
     count = max(1, max(len(s) for s in slots))
     points = np.zeros((len(batch), count, model.info.vertex_count, 2), np.float32)
@@ -291,13 +276,8 @@ def _call(model: MapModel, batch: list[_Loaded], slots: list[PriorSlots]) -> dic
         points[k, : len(s)] = s.points
         classes[k, : len(s)] = s.class_index
         mask[k, : len(s)] = 1
-    return model(
-        np.stack([item.images for item in batch]),
-        np.stack([item.ego_to_image for item in batch]),
-        points,
-        classes,
-        mask,
-    )
+    given = [np.stack(values) for values in zip(*(item.given for item in batch), strict=True)]
+    return model(*given, points, classes, mask)
 
 
 def _observations(

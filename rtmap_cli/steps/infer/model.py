@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
@@ -61,25 +60,20 @@ class MapModel:
         )
         self._inputs, self._outputs = tuple(inputs_of(self.info)), tuple(outputs_of(self.info))
 
-    def __call__(
-        self,
-        images: NDArray[np.uint8],
-        ego_to_image: NDArray[np.float32],
-        prior_points: NDArray[np.float32],
-        prior_class: NDArray[np.int64],
-        prior_mask: NDArray[np.float32],
-    ) -> dict[str, Any]:
-        """Run a batch: images (B, N, H, W, 3), ego_to_image (B, N, 3, 4), prior_points
-        (B, P, V, 2), prior_class and prior_mask (B, P). Returns the outputs of the contract by
-        name: scores (B, Q, C), points and sigma (B, Q, V, 2) in metres, prior_score (B, P),
-        pose_delta (B, 3), pose_covariance (B, 3, 3). BadInput when the model cannot run or its
-        answer breaks the contract."""
-        values = (images, ego_to_image, prior_points, prior_class, prior_mask)
+    def __call__(self, *values: NDArray[Any]) -> dict[str, Any]:
+        """Run a batch: images (B, N, H, W, 3) and ego_to_image (B, N, 3, 4), or raster
+        (B, K, rows, columns); then prior_points (B, P, V, 2), prior_class and prior_mask (B, P),
+        in the order of `inputs_of`.
+
+        Returns the outputs of the contract by name: scores (B, Q, C), points and sigma
+        (B, Q, V, 2) in metres, prior_score (B, P), pose_delta (B, 3), pose_covariance (B, 3, 3).
+        BadInput when the model cannot run or its answer breaks the contract.
+        """
         feed = dict(zip(self._inputs, values, strict=True))
         try:
             answers = self.session.run(list(self._outputs), feed)
         except Exception as error:  # onnxruntime raises its own untyped errors
             raise BadInput(self.path, f"the model cannot run ({first_line(error)})") from None
         out = dict(zip(self._outputs, answers, strict=True))
-        check_answer(self.path, self.info, out, *prior_mask.shape)
+        check_answer(self.path, self.info, out, *values[-1].shape)
         return out

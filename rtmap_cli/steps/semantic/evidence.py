@@ -102,7 +102,12 @@ def read_confusion(path: Path) -> Array:
         raise BadInput(path, f"the matrix is not {len(CLASSES)} × {len(CLASSES)} numbers")
     if (matrix < 0).any() or (matrix.sum(axis=1) <= 0).any():
         raise BadInput(path, "the matrix has a negative entry or an empty row")
-    # An entry of 0 would let one observation forbid a class for ever.
+    return floored(matrix)
+
+
+def floored(matrix: Array) -> Array:
+    """A confusion matrix whose rows add up to one and no entry of which is 0, which would let one
+    observation forbid a class for ever."""
     matrix = np.maximum(matrix / matrix.sum(axis=1, keepdims=True), 1e-3)
     out: Array = matrix / matrix.sum(axis=1, keepdims=True)
     return out

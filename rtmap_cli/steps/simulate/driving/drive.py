@@ -24,6 +24,7 @@ from rtmap_cli.steps.simulate.driving.drives import Drive, drive_over_route, thi
 from rtmap_cli.steps.simulate.driving.routes import Lane, route_of
 from rtmap_cli.steps.simulate.perceiving.noise import generator
 from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
+from rtmap_cli.steps.simulate.towns.profiles import STYLES
 from rtmap_cli.steps.simulate.towns.town import make_town
 from rtmap_cli.steps.simulate.worlds.world_objects import random_vehicle
 
@@ -40,7 +41,7 @@ OFF_ROAD = 0.1
 
 
 def town_lanes(info: dict[str, Any], vector_map: VectorMap, surface: Any, path: Path) -> list[Lane]:
-    """The lanes of a town map, made again from the seed and size that its history records.
+    """The lanes of a town map, made again from the seed, size and style that its history records.
 
     BadInput when the map is no town, or when the lanes do not lie on its asphalt.
     """
@@ -49,7 +50,10 @@ def town_lanes(info: dict[str, Any], vector_map: VectorMap, surface: Any, path: 
         raise BadInput(
             path, "was not made by rtmap simulate town, its lanes are unknown", "name a --log"
         )
-    town = make_town(int(made["seed"]), float(made["size"]))
+    style = str(made.get("style", "mixed"))
+    if style not in STYLES:
+        raise BadInput(path, f"its town has an unknown style {style}", "make it again")
+    town = make_town(int(made["seed"]), float(made["size"]), style=style)
     points = np.concatenate(town.lanes)
     off = 1 - shapely.contains_xy(surface, points[:, 0], points[:, 1]).mean()
     if vector_map.crs != town.vector_map.crs or off > OFF_ROAD:

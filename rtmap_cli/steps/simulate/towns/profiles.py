@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -100,14 +101,65 @@ MEDIAN_MARKS = {
 PATTERNS = {"zebra": 0.4, "ladder": 0.25, "outline": 0.35}
 
 
-def draw(rng: np.random.Generator, shares: dict[str, float]) -> str:
+@dataclass(frozen=True)
+class TownStyle:
+    """How a place builds and paints its streets; pairs are for main and for minor streets.
+
+    ``lane`` is the range of lane widths (m); ``lanes`` the shares of one, two and three lanes per
+    direction; ``one_way``, ``painted`` and ``parking`` are chances, ``edge`` that of edge lines;
+    ``centre`` shares the marks between the directions, ``patterns`` those of crossings.
+    """
+
+    lane: Pair = (2.75, 3.7)
+    lanes: tuple[tuple[float, float, float], tuple[float, float, float]] = (
+        (0.42, 0.43, 0.15),
+        (0.9, 0.1, 0.0),
+    )
+    one_way: Pair = (0.08, 0.22)
+    painted: Pair = (0.94, 0.48)
+    bikes: float = 0.26
+    parking: float = 0.36
+    edge: float = 0.45
+    centre: Mapping[str, float] = field(default_factory=lambda: CENTRE_MARKS)
+    patterns: Mapping[str, float] = field(default_factory=lambda: PATTERNS)
+
+
+STYLES = {
+    "mixed": TownStyle(),
+    "city": TownStyle(
+        lane=(3.35, 3.9),
+        lanes=((0.2, 0.5, 0.3), (0.75, 0.25, 0.0)),
+        painted=(0.98, 0.7),
+        parking=0.6,
+        edge=0.35,
+        centre={"DOUBLE_SOLID_YELLOW": 0.7, "DASHED_YELLOW": 0.2, "SOLID_YELLOW": 0.1},
+        patterns={"zebra": 0.15, "ladder": 0.45, "outline": 0.4},
+    ),
+    "campus": TownStyle(
+        lane=(2.55, 3.05),
+        lanes=((0.8, 0.2, 0.0), (1.0, 0.0, 0.0)),
+        painted=(0.92, 0.75),
+        bikes=0.3,
+        parking=0.12,
+        edge=0.3,
+        centre={"DASHED_WHITE": 0.35, "SOLID_YELLOW": 0.3, "DASHED_YELLOW": 0.35},
+        patterns={"zebra": 0.75, "ladder": 0.15, "outline": 0.1},
+    ),
+}
+"""``city``: wide lanes, several of them, parked cars, ladders and outlines. ``campus``: lanes of
+10 ft and less, one per direction, single lines, zebras. ``mixed``: anything."""
+
+
+def draw(rng: np.random.Generator, shares: Mapping[str, float]) -> str:
     """One of the keys, with the shares as probabilities."""
     return str(rng.choice(list(shares), p=list(shares.values())))
 
 
-def random_profile(rng: np.random.Generator, rank: str) -> Profile:
+def random_profile(
+    rng: np.random.Generator, rank: str, style: TownStyle = STYLES["mixed"]
+) -> Profile:
     """A cross-section of rank ``main``, ``minor`` or ``alley``."""
-    pattern = draw(rng, PATTERNS)
+    pattern = draw(rng, style.patterns)
     if rank == "alley":
         wide = float(rng.uniform(1.9, 3.1))
         none = (0.0, 0.0)
@@ -115,27 +167,27 @@ def random_profile(rng: np.random.Generator, rank: str) -> Profile:
             (wide,), (wide,), 0, none, none, none, None, None, None, False, 0.04, pattern, rank
         )
     main = rank == "main"
-    ahead = int(rng.choice([1, 2, 3], p=[0.42, 0.43, 0.15] if main else [0.9, 0.1, 0]))
+    ahead = int(rng.choice([1, 2, 3], p=style.lanes[not main]))
     back = ahead if rng.random() < 0.65 else int(rng.choice([1, 2]))
-    if rng.random() < (0.08 if main else 0.22):
+    if rng.random() < style.one_way[not main]:
         back = 0
-    lane = rng.uniform(2.75, 3.7)
+    lane = rng.uniform(*style.lane)
     forward, backward = (
         tuple(float(w) for w in lane + rng.uniform(-0.15, 0.35, n) * (rng.random() < 0.5))
         for n in (ahead, back)
     )
     median = _median(rng, main) if back else 0.0
-    painted = rng.random() < (0.94 if main else 0.48)
-    bikes = painted and rng.random() < 0.26
+    painted = rng.random() < style.painted[not main]
+    bikes = painted and rng.random() < style.bikes
     bike, buffer, shoulder = np.zeros((3, 2))
     for side in (0, 1):
         if bikes and rng.random() < 0.8 and (back or side):
             bike[side] = rng.uniform(1.3, 2.0)
             buffer[side] = rng.uniform(0.5, 1.1) if rng.random() < 0.3 else 0.0
-        parking = rng.random() < 0.36
+        parking = rng.random() < style.parking
         shoulder[side] = rng.uniform(1.9, 2.8) if parking else rng.choice([0.1, 0.3, 0.6, 1.0])
-    edge = "SOLID_WHITE" if painted and (bikes or rng.random() < 0.45) else None
-    marks = MEDIAN_MARKS if median else CENTRE_MARKS
+    edge = "SOLID_WHITE" if painted and (bikes or rng.random() < style.edge) else None
+    marks = MEDIAN_MARKS if median else style.centre
     return Profile(
         forward,
         backward,

@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import arc_length, normals, resample_step
-from rtmap_cli.steps.simulate.towns.profiles import Profile, random_profile
+from rtmap_cli.steps.simulate.towns.profiles import Profile, TownStyle, random_profile
 
 Array = NDArray[np.float64]
 
@@ -119,7 +119,7 @@ class Street:
         return float(shapely.linestrings(self.line).project(shapely.points(place)))
 
 
-def lay_streets(rng: np.random.Generator, size: float) -> list[Street]:
+def lay_streets(rng: np.random.Generator, size: float, style: TownStyle) -> list[Street]:
     """Streets about ``size`` metres across, centred at the origin, from straight to winding.
 
     The grid is sheared, single streets run askew; some end at another one (tee junctions) or go on
@@ -130,16 +130,16 @@ def lay_streets(rng: np.random.Generator, size: float) -> list[Street]:
     warp = _Warp(rng, bend)
     wavy = bool(bend > 0)
     first = [_track(rng, size, float(offset), 0, wavy) for offset in grid[0]]
-    streets = [_street(rng, warp(p), _rank(rng, 0.5)) for p in first]
+    streets = [_street(rng, warp(p), _rank(rng, 0.5), style) for p in first]
     for offset in grid[1]:
         line = warp(_track(rng, size, float(offset), 1, wavy))
         rank = _rank(rng, 0.3)
-        streets += _cut(rng, line, rank, streets[: len(first)], size)
+        streets += _cut(rng, line, rank, streets[: len(first)], size, style)
     for axis in (0, 1):
         for low, high in zip(grid[axis], grid[axis][1:], strict=False):
             if rng.random() < 0.4 and high - low > 55:
                 line = warp(_track(rng, size, (low + high) / 2 + rng.normal(0, 4), axis, wavy))
-                streets += _alley(rng, line, streets)
+                streets += _alley(rng, line, streets, style)
     return streets
 
 
@@ -181,15 +181,24 @@ def _track(rng: np.random.Generator, size: float, offset: float, axis: int, wavy
 
 
 def _street(
-    rng: np.random.Generator, line: Array, rank: str, closed: tuple[bool, bool] = (False, False)
+    rng: np.random.Generator,
+    line: Array,
+    rank: str,
+    style: TownStyle,
+    closed: tuple[bool, bool] = (False, False),
 ) -> Street:
     if rng.random() < 0.5:
         line, closed = line[::-1], closed[::-1]
-    return Street(line, random_profile(rng, rank), closed)
+    return Street(line, random_profile(rng, rank, style), closed)
 
 
 def _cut(
-    rng: np.random.Generator, line: Array, rank: str, others: list[Street], size: float
+    rng: np.random.Generator,
+    line: Array,
+    rank: str,
+    others: list[Street],
+    size: float,
+    style: TownStyle,
 ) -> list[Street]:
     """The street, or what is left of it when it ends at another one, jogs or ends blind."""
     kind = rng.random()
@@ -201,28 +210,28 @@ def _cut(
         if p.geom_type == "Point"
     )
     if not meets or kind > 0.62:
-        return [_street(rng, line, rank)]
+        return [_street(rng, line, rank, style)]
     s = arc_length(line)
     cut = meets[rng.integers(len(meets))]
     if kind < 0.3 or (size < 320 and kind < 0.4):  # tee
         if cut > s[-1] / 2:
-            return [_street(rng, _part(line, 0, cut), rank, (False, True))]
-        return [_street(rng, _part(line, cut, s[-1]), rank, (True, False))]
+            return [_street(rng, _part(line, 0, cut), rank, style, (False, True))]
+        return [_street(rng, _part(line, cut, s[-1]), rank, style, (True, False))]
     if kind < 0.5:  # jog
         aside = rng.uniform(6, 28) * rng.choice([-1, 1])
         along = line[-1] - line[0]
         step = np.array([-along[1], along[0]]) / np.hypot(*along) * aside
         moved = line + step
         other = _crossing_with(moved, others, cut)
-        pieces = [_street(rng, _part(line, 0, cut), rank, (False, True))]
+        pieces = [_street(rng, _part(line, 0, cut), rank, style, (False, True))]
         if other is not None:
             rest = _part(moved, other, arc_length(moved)[-1])
-            pieces.append(_street(rng, rest, rank, (True, False)))
+            pieces.append(_street(rng, rest, rank, style, (True, False)))
         return pieces
     if kind < 0.58:  # blind end
         end = min(s[-1], meets[-1] + rng.uniform(35, 60))
-        return [_street(rng, _part(line, 0, end), rank, (False, True))]
-    return [_street(rng, line, rank)]
+        return [_street(rng, _part(line, 0, end), rank, style, (False, True))]
+    return [_street(rng, line, rank, style)]
 
 
 def _crossing_with(line: Array, others: list[Street], near: float) -> float | None:
@@ -237,7 +246,9 @@ def _crossing_with(line: Array, others: list[Street], near: float) -> float | No
     return min(found, key=lambda x: abs(x - near)) if found else None
 
 
-def _alley(rng: np.random.Generator, line: Array, streets: list[Street]) -> list[Street]:
+def _alley(
+    rng: np.random.Generator, line: Array, streets: list[Street], style: TownStyle
+) -> list[Street]:
     """An alley along the line between two of the streets that it meets."""
     whole = shapely.linestrings(line)
     meets = sorted(
@@ -252,7 +263,7 @@ def _alley(rng: np.random.Generator, line: Array, streets: list[Street]) -> list
     last = min(len(meets) - 1, k + int(rng.integers(1, 4)))
     if meets[last] - meets[k] < 40:
         return []
-    return [_street(rng, _part(line, meets[k], meets[last]), "alley", (True, True))]
+    return [_street(rng, _part(line, meets[k], meets[last]), "alley", style, (True, True))]
 
 
 def _part(line: Array, start: float, end: float) -> Array:

@@ -22,6 +22,7 @@ from rtmap_cli.steps.simulate.towns.junctions import (
 )
 from rtmap_cli.steps.simulate.towns.lanes import lane_network
 from rtmap_cli.steps.simulate.towns.paint import lay_dividers, let_paint_pass
+from rtmap_cli.steps.simulate.towns.profiles import STYLES
 from rtmap_cli.steps.simulate.towns.streets import lay_streets
 
 Array = NDArray[np.float64]
@@ -46,17 +47,20 @@ class Town:
     size: float
 
 
-def make_town(seed: int, size: float = DEFAULT_SIZE, roundabout: bool | None = None) -> Town:
+def make_town(
+    seed: int, size: float = DEFAULT_SIZE, roundabout: bool | None = None, style: str = "mixed"
+) -> Town:
     """A town drawn from ``seed``; ``size`` metres across (150 gives a single junction or two).
 
     ``roundabout`` None: always one in towns of 300 m and more, in every tenth smaller scene.
+    ``style`` is a key of `STYLES`: how the streets are built and painted.
     The map frame is EPSG:32632 around 500 km east, 5,400 km north; three towns of four lie on
     gentle hills (up to 8 %), the others are flat, z = 0.
     Classes: ``boundary`` closed outlines of the asphalt, ``divider`` painted lines with their
     ``mark``, ``ped_crossing`` quads with their ``pattern``.
     """
     rng = np.random.default_rng([seed, 20])
-    streets = lay_streets(rng, size)
+    streets = lay_streets(rng, size, STYLES[style])
     if roundabout is None:
         roundabout = size >= 300 or rng.random() < 0.1
     junctions = find_junctions(streets)

@@ -1,0 +1,1 @@
+"""Semantic rasters: their network, and simulated drives to learn from."""
