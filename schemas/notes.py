@@ -145,6 +145,7 @@ TABLES = {
         "y": "left, m",
         "z": "up, m",
         "intensity": "0 to 1",
+        "time": "s from the time of the sweep; 0 everywhere: motion compensated",
     },
     "rtmap.semantic.windows": VEHICLE_POSE
     | {
