@@ -24,6 +24,8 @@ NEIGHBOURS = 10
 ITERATIONS = 25
 FORGET = 120
 """Insertions after which a voxel that nothing touched leaves the local map."""
+REACHES = (2.0, 1.0)
+"""How far partners of GICP may be (m), round by round."""
 FREE = 5.0
 """Cost of a point without a partner, in the unit of squared Mahalanobis distance / 2."""
 
@@ -133,13 +135,13 @@ class Gicp:
         self._target = None
 
     def match(self, prepared: Any, guess: Array) -> Match:
-        """Two rounds: partners within 4 leaves, then within 2."""
+        """Two rounds: partners within 2 m, then within 1 m, which is how far rings lie apart."""
         if self._target is None:
             self._target = self._package.preprocess_points(
                 self.local_points(), self.leaf, NEIGHBOURS, 1
             )
         pose = guess
-        for reach in (4 * self.leaf, 2 * self.leaf):
+        for reach in REACHES:
             r = self._package.align(
                 *(self._target[0], prepared, self._target[1], pose),
                 *("GICP", reach, 1, ITERATIONS, 2e-4, 1e-3),

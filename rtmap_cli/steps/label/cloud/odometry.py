@@ -64,6 +64,11 @@ class Odometry:
         self._step_s = 0.1
         self._costs: list[float] = []
 
+    @property
+    def matcher_leaf(self) -> float:
+        """Side of the cells (m) that sweeps are thinned to."""
+        return self.matcher.leaf if self.matcher else float(self._leaf or 0.5)
+
     def add(self, sweep: Sweep, time: float, motion: Array | None = None) -> Step:
         """Register a cleaned sweep of ``time`` (s).
 
@@ -74,6 +79,8 @@ class Odometry:
             return self._first(sweep, time)
         elapsed = max(time - self._time, 1e-3)
         expected = self._expected(elapsed, motion)
+        if not len(sweep):
+            return self._lost(self._pose @ expected, time, elapsed)
         known = motion is not None or self._delta is not None
         guess = self._pose @ expected
         twist = lie.log(expected) / elapsed
@@ -120,6 +127,12 @@ class Odometry:
         found = starts(here, xyz, SEARCH_REACH, SEARCH_YAWS)
         other = best_start(self.matcher, prepared, [self._pose @ pose for _, pose in found])
         return other if other.cost < first.cost else first
+
+    def _lost(self, pose: Array, time: float, elapsed: float) -> Step:
+        """A sweep without points: the expected motion."""
+        self._delta, self._step_s = invert(self._pose) @ pose, elapsed
+        self._pose, self._time = pose, time
+        return Step(pose, np.zeros((6, 6)), LOST, None, False, np.zeros((0, 3)), 0.0, 0.0)
 
     def _take(
         self, match: Match, guess: Array, xyz: Array, prepared: Any, time: float, elapsed: float

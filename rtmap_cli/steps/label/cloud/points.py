@@ -81,7 +81,7 @@ def thinned(xyz: Array, cell: float) -> Array:
     return np.stack(sums, axis=-1) / count[:, None]
 
 
-def leaf_of(xyz: Array, wanted: int = 6000) -> float:
+def leaf_of(xyz: Array, wanted: int = 9000) -> float:
     """The cell side (m) that thins a sweep to about ``wanted`` points, of a fixed ladder."""
     for leaf in (0.2, 0.3, 0.4, 0.5, 0.65, 0.8):
         if len(np.unique(cell_keys(xyz, leaf))) <= wanted:
