@@ -63,6 +63,7 @@ class Odometry:
         self._delta: Array | None = None
         self._step_s = 0.1
         self._costs: list[float] = []
+        self._opening: Sweep | None = None
 
     @property
     def matcher_leaf(self) -> float:
@@ -95,6 +96,9 @@ class Odometry:
             if np.abs(twist - before).max() * span < SKEW_DOUBT:
                 break
             guess = match.pose
+            if self._opening is not None:
+                self._begin_again(twist)
+        self._opening = None
         return self._take(match, self._pose @ expected, xyz, prepared, time, elapsed)
 
     def _first(self, sweep: Sweep, time: float) -> Step:
@@ -102,7 +106,15 @@ class Odometry:
         self.matcher = make_matcher(self.method, leaf)
         self._insert(self.matcher.prepare(sweep.xyz))
         self._time = time
+        self._opening = sweep if sweep.time is not None else None
         return Step(self._pose, np.zeros((6, 6)), OK, None, True, sweep.xyz, 1.0, 0.0)
+
+    def _begin_again(self, twist: Array) -> None:
+        """The local map anew from the first sweep, now that its motion (6,) is known."""
+        assert self._opening is not None
+        self.matcher = make_matcher(self.method, self.matcher_leaf)
+        self._inserted = None
+        self._insert(self.matcher.prepare(deskewed(self._opening, twist)))
 
     def _expected(self, elapsed: float, motion: Array | None) -> Array:
         """(4, 4) motion since the last sweep before this one is looked at."""

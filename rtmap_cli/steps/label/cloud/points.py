@@ -81,9 +81,14 @@ def thinned(xyz: Array, cell: float) -> Array:
     return np.stack(sums, axis=-1) / count[:, None]
 
 
+LEAVES = (0.6, 0.7, 0.8, 1.0, 1.25)
+"""Cells that sweeps may be thinned to (m): in smaller ones the neighbours of a point lie on its own
+ring, and its surface is not seen."""
+
+
 def leaf_of(xyz: Array, wanted: int = 9000) -> float:
-    """The cell side (m) that thins a sweep to about ``wanted`` points, of a fixed ladder."""
-    for leaf in (0.2, 0.3, 0.4, 0.5, 0.65, 0.8):
+    """The cell side (m) of `LEAVES` that thins a sweep to ``wanted`` points or fewer."""
+    for leaf in LEAVES[:-1]:
         if len(np.unique(cell_keys(xyz, leaf))) <= wanted:
             return leaf
-    return 1.0
+    return LEAVES[-1]
