@@ -134,8 +134,7 @@ def _fixes(start: Array, gnss: Array, sigma: Array, length: float) -> Fixes:
     repeats = np.clip(length / np.maximum(spacing, 0.1), 1.0, None)
     place = np.hypot(sigma[:, 0], sigma[:, 1]) / np.sqrt(2)
     turn = np.maximum(sigma[:, 2], ATTITUDE)
-    scaled = np.stack([place, turn], axis=-1) * np.sqrt(repeats)[:, None]
-    return Fixes(np.arange(len(gnss)), gnss, scaled)
+    return Fixes(np.arange(len(gnss)), gnss, np.stack([place, turn], axis=-1), repeats)
 
 
 def _alike(solved: Solved, start: Array) -> float:

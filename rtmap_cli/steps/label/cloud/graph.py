@@ -53,11 +53,13 @@ class Edges:
 @dataclass
 class Fixes:
     """Places and attitudes from GNSS: ``pose`` (f, 4, 4) of keyframes ``i`` (f,), ``sigma`` (f, 2):
-    standard deviations of a coordinate (m) and of an angle (rad)."""
+    standard deviations of a coordinate (m) and of an angle (rad); ``repeats`` (f,): fixes that
+    share an error, and together count as one."""
 
     i: Int
     pose: Array
     sigma: Array
+    repeats: Array
 
 
 @dataclass
@@ -88,8 +90,9 @@ def solve(start: Array, edges: Edges, fixes: Fixes | None, most_marginals: int =
         width = max(WIDTH, min(width / SHRINK, 2 * worst))
         w_edge = np.where(edges.doubted, _weight(d_edge, width), 1.0)
         w_fix = _weight(d_fix, width)
+        shared = w_fix if fixes is None else w_fix / fixes.repeats
         matrix, gradient = _normal(
-            pose, edges, fixes, (r_edge, r_place, r_turn), w_edge, w_fix
+            pose, edges, fixes, (r_edge, r_place, r_turn), w_edge, shared
         )
         factor = _factored(matrix)
         step = -factor.solve(gradient).reshape(-1, 6)

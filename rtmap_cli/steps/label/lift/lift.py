@@ -1,0 +1,151 @@
+"""Every vertex of a map gets the height of the ground under it, with a standard deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rtmap_cli.logs.cloud import CloudFolder
+from rtmap_cli.maps.element import Element
+from rtmap_cli.steps.label.lift.levels import chosen, offers, samples
+from rtmap_cli.steps.label.lift.planes import heights
+
+Array = NDArray[np.float64]
+
+NEIGHBOURS, RADIUS = 40, 2.5
+"""Points that make a patch, and how far they may be (m)."""
+FLATTENED = 0.3
+"""Heights count so much in the distance of neighbours: a road is flat, a bridge is not near."""
+BAND, BAND_SHARE, BAND_MOST = 0.6, 0.12, 2.0
+"""Ground lies so close to the height of the nearest driven road (m): at it, per metre beside it,
+and at most, which is half of the room under a bridge."""
+
+
+@dataclass
+class Lifted:
+    """Heights ``z`` (n,) and ``sigma`` (n,) of all vertices, NaN where unknown."""
+
+    z: Array
+    sigma: Array
+
+
+def lift(elements: Sequence[Element], cloud: CloudFolder) -> tuple[list[Element], Lifted]:
+    """The elements with heights from the cloud; what is not known stays NaN.
+
+    The height's variance holds the scatter of the plane and the trajectory's own variance there.
+    """
+    reference, beside, variance = _references(elements, cloud)
+    xy = np.concatenate([e.xy for e in elements])
+    z, sigma = np.full(len(xy), np.nan), np.full(len(xy), np.nan)
+    known = np.isfinite(reference)
+    tile = np.floor(xy / cloud.tile).astype(np.int64)
+    there = set(cloud.tiles())
+    rows = np.flatnonzero(known)
+    order = rows[np.lexsort((tile[rows, 1], tile[rows, 0]))]
+    split = np.flatnonzero((np.diff(tile[order], axis=0) != 0).any(axis=1)) + 1
+    near = np.full((len(rows), NEIGHBOURS, 3), np.nan, np.float32)
+    done = 0
+    groups = np.split(order, split) if len(order) else []
+    for group in groups:
+        i, j = tile[group[0]].tolist()
+        around = [(a, b) for a in (i - 1, i, i + 1) for b in (j - 1, j, j + 1)]
+        points = _points(cloud, [t for t in around if t in there], xy[group])
+        near[done : done + len(group)] = _patches(
+            points, xy[group], reference[group], beside[group]
+        )
+        done += len(group)
+    if done:
+        found = heights(near.astype(np.float64), reference[order])
+        z[order] = found.z
+        sigma[order] = np.sqrt(found.sigma**2 + variance[order])
+    out, first = [], 0
+    for element in elements:
+        rows_of = slice(first, first + len(element.points))
+        first = rows_of.stop
+        out.append(_with_heights(element, z[rows_of], sigma[rows_of]))
+    return out, Lifted(z, sigma)
+
+
+def _with_heights(element: Element, z: Array, sigma: Array) -> Element:
+    """The element at these heights; what it said of x and y stays."""
+    points = np.column_stack([element.xy, z])
+    covariance = np.full((len(points), 4), np.nan)
+    if element.covariance is not None:
+        covariance[:, :3] = element.covariance[:, :3]
+    covariance[:, 3] = sigma**2
+    return element.with_points(points, covariance)
+
+
+def _references(
+    elements: Sequence[Element], cloud: CloudFolder
+) -> tuple[Array, Array, Array]:
+    """For every vertex the height of the road driven nearest (NaN: none), metres beside it, and
+    the variance of that height."""
+    from scipy.spatial import cKDTree
+
+    path = cloud.trajectory()
+    places, headings = samples(path.pose[:, :3, 3], path.ground_z)
+    xy = np.concatenate([e.xy for e in elements])
+    heading = np.concatenate([_headings(e.xy) for e in elements])
+    offered, cost = offers(xy, heading, places, headings)
+    reference = np.empty(len(xy))
+    first = 0
+    for element in elements:
+        rows = slice(first, first + len(element.points))
+        first = rows.stop
+        reference[rows] = chosen(xy[rows], offered[rows], cost[rows])
+    if not len(places):
+        return reference, np.full(len(xy), np.inf), np.zeros(len(xy))
+    beside = cKDTree(places[:, :2]).query(xy)[0]
+    nearest = cKDTree(path.pose[:, :2, 3]).query(xy)[1]
+    return reference, beside, np.maximum(path.covariance[nearest, 2, 2], 0.0)
+
+
+def _headings(xy: Array) -> Array:
+    """(n,) headings of a line's vertices."""
+    return np.asarray(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
+
+
+def _points(cloud: CloudFolder, tiles: list[tuple[int, int]], xy: Array) -> Array:
+    """(m, 3) points of the tiles within reach of vertices (n, 2), heights flattened."""
+    low, high = xy.min(axis=0) - RADIUS, xy.max(axis=0) + RADIUS
+    size = np.ceil((high - low) / RADIUS).astype(int) + 2
+    wanted = np.zeros(size, bool)
+    at = np.floor((xy - low) / RADIUS).astype(int)
+    for dx in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            wanted[tuple(np.clip(at + (dx, dy), 0, size - 1).T)] = True
+    parts = []
+    for tile in tiles:
+        xyz = cloud.read_xyz(*tile)
+        inside = ((xyz[:, :2] >= low) & (xyz[:, :2] < high)).all(axis=1)
+        xyz = xyz[inside]
+        cell = np.floor((xyz[:, :2] - low) / RADIUS).astype(int)
+        parts.append(xyz[wanted[cell[:, 0], cell[:, 1]]])
+    return np.concatenate([*parts, np.zeros((0, 3))])
+
+
+def _patches(points: Array, xy: Array, reference: Array, beside: Array) -> NDArray[np.float32]:
+    """(n, NEIGHBOURS, 3) points about each vertex, known ones first, NaN after them."""
+    from scipy.spatial import cKDTree
+
+    out = np.full((len(xy), NEIGHBOURS, 3), np.nan, np.float32)
+    if len(points) < 3:
+        return out
+    flat = points * (1.0, 1.0, FLATTENED)
+    tree = cKDTree(flat, leafsize=32, balanced_tree=False, compact_nodes=False)
+    centre = np.column_stack([xy, FLATTENED * reference])
+    count = min(NEIGHBOURS, len(points))
+    away, at = tree.query(centre, count, distance_upper_bound=RADIUS)
+    found = np.isfinite(away)
+    at = np.where(found, at, 0)
+    near = points[at] - np.concatenate([xy, np.zeros((len(xy), 1))], axis=1)[:, None]
+    band = np.minimum(BAND + BAND_SHARE * beside, BAND_MOST)
+    found &= np.abs(near[..., 2] - reference[:, None]) < band[:, None]
+    near[~found] = np.nan
+    order = np.argsort(~found, axis=1, kind="stable")
+    out[:, :count] = np.take_along_axis(near, order[..., None], axis=1)
+    return out

@@ -1,0 +1,137 @@
+"""The height of the ground at many places at once: a robust plane through the points around each.
+
+RANSAC (Fischler and Bolles 1981): planes through three of the points are tried and the one that
+most points agree with is fitted again, by weighted least squares, to those. Where a good share of
+the points agrees with a lower plane (the road below a curb, or under a vehicle), that one counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+TRIALS = 20
+STEEPEST = 0.25
+"""A ground is not steeper (m per m)."""
+LOWER, LOWER_SHARE = 0.06, 0.25
+"""A plane this much lower (m) is taken when so many of the points lie on it."""
+FEWEST = 6
+FIRST_GATE, GATES = 0.1, (0.03, 0.12)
+"""Points within this of a plane lie on it (m): at first, and between these by the scatter found."""
+TRUST = 0.01
+"""Points of one sweep err together: a height is not known better (m)."""
+WIDTH = 1.0
+"""Points so far away (m) count about half."""
+ROWS = 4096
+
+
+@dataclass
+class Heights:
+    """Heights ``z`` (n,) and standard deviations ``sigma`` (n,), NaN where nothing tells, and the
+    number of points (n,) on the plane."""
+
+    z: Array
+    sigma: Array
+    support: NDArray[np.int64]
+
+
+def heights(near: Array, reference: Array, seed: int = 0) -> Heights:
+    """The ground at n places from the points around them.
+
+    ``near`` (n, k, 3): points about each place in x and y (m), heights in the map frame, NaN rows
+    where there are fewer; ``reference`` (n,) a rough height.
+    """
+    rng = np.random.default_rng([seed, 17])
+    n = len(near)
+    out = Heights(np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, np.int64))
+    gate = FIRST_GATE
+    for first in range(0, n, ROWS):
+        part = slice(first, first + ROWS)
+        points = near[part].copy()
+        points[..., 2] -= reference[part, None]
+        if first == 0:
+            scatter = _scatter(points, _planes(points, gate, rng), gate)
+            gate = float(np.clip(3.0 * scatter, *GATES))
+        z, sigma, support = _fitted(points, _planes(points, gate, rng), gate)
+        out.z[part], out.sigma[part], out.support[part] = z + reference[part], sigma, support
+    return out
+
+
+def _planes(points: Array, gate: float, rng: np.random.Generator) -> Array:
+    """(m, 3) the plane z = a x + b y + c that counts at each place; NaN where there is none."""
+    known = np.isfinite(points[..., 2])
+    count = known.sum(axis=1)
+    m = len(points)
+    # Known points come first; some of them, anew for every place.
+    pick = (rng.random((m, TRIALS, 3)) * np.maximum(count, 1)[:, None, None]).astype(np.int64)
+    p = points[np.arange(m)[:, None, None], pick]
+    u, v = p[:, :, 1] - p[:, :, 0], p[:, :, 2] - p[:, :, 0]
+    det = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a = (u[..., 2] * v[..., 1] - v[..., 2] * u[..., 1]) / det
+        b = (u[..., 0] * v[..., 2] - v[..., 0] * u[..., 2]) / det
+        c = p[:, :, 0, 2] - a * p[:, :, 0, 0] - b * p[:, :, 0, 1]
+    even = np.nanmedian(np.where(known, points[..., 2], np.nan), axis=1)
+    flat = np.stack([np.zeros(m), np.zeros(m), even], axis=-1)
+    trial = np.concatenate([np.stack([a, b, c], axis=-1), flat[:, None]], axis=1)
+    bad = ~np.isfinite(trial).all(axis=-1) | (np.hypot(trial[..., 0], trial[..., 1]) > STEEPEST)
+    trial[bad] = np.nan
+    votes = np.zeros(trial.shape[:2], np.int64)
+    filled = np.where(known[..., None], points, np.nan)
+    for k in range(trial.shape[1]):
+        r = _residual(filled, trial[:, k])
+        votes[:, k] = (np.abs(r) < gate).sum(axis=1)
+    votes[bad] = 0
+    best = votes.argmax(axis=1)
+    rows = np.arange(m)
+    height = trial[rows, best, 2]
+    lower = (trial[..., 2] < height[:, None] - LOWER) & (
+        votes >= np.maximum(LOWER_SHARE * count[:, None], FEWEST)
+    )
+    second = np.where(lower, votes, -1).argmax(axis=1)
+    chosen = np.where(lower.any(axis=1), second, best)
+    out = trial[rows, chosen]
+    out[(votes[rows, chosen] < FEWEST) | (count < FEWEST)] = np.nan
+    return np.asarray(out)
+
+
+def _residual(points: Array, plane: Array) -> Array:
+    """(m, k) heights of points over a plane each."""
+    on = plane[:, None, 0] * points[..., 0] + plane[:, None, 1] * points[..., 1]
+    return np.asarray(points[..., 2] - on - plane[:, None, 2])
+
+
+def _scatter(points: Array, plane: Array, gate: float) -> float:
+    """Standard deviation of points about their planes, by the median."""
+    r = np.abs(_residual(points, plane))
+    r = r[np.isfinite(r) & (r < 2 * gate)]
+    return float(1.4826 * np.median(r)) if len(r) else gate / 3
+
+
+def _fitted(points: Array, plane: Array, gate: float) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Least squares over the points on each plane: height, its standard deviation, points."""
+    with np.errstate(invalid="ignore"):
+        on = np.abs(_residual(points, plane)) < gate
+    filled = np.where(on[..., None], points, 0.0)
+    far = (filled[..., 0] ** 2 + filled[..., 1] ** 2) / WIDTH**2
+    w = np.where(on, np.exp(-0.5 * far), 0.0)
+    design = np.concatenate([filled[..., :2], np.ones((*w.shape, 1))], axis=-1)
+    normal = np.einsum("mk,mki,mkj->mij", w, design, design)
+    # A slope of about STEEPEST / 2 is likely: where points lie in a row it is not free.
+    normal[:, range(2), range(2)] += (gate / STEEPEST) ** 2
+    right = np.einsum("mk,mki,mk->mi", w, design, filled[..., 2])
+    support = on.sum(axis=1)
+    good = np.isfinite(plane).all(axis=1) & (support >= FEWEST)
+    z, sigma = np.full(len(points), np.nan), np.full(len(points), np.nan)
+    if good.any():
+        solution = np.linalg.solve(normal[good], right[good][..., None])[..., 0]
+        r = _residual(filled[good], solution)
+        spread = (w[good] * r**2).sum(axis=1) / np.maximum(w[good].sum(axis=1), 1e-9)
+        inverse = np.linalg.inv(normal[good])[:, 2, 2]
+        z[good] = solution[:, 2]
+        sigma[good] = np.sqrt(spread * inverse + TRUST**2)
+    return z, sigma, support
