@@ -122,7 +122,18 @@ def main() -> None:
         logs = given.log or simulated(Path(name), given.sweeps)
         for path in logs:
             rows += measured(path.name, NativeLog(path), given.sweeps, given.points)
-    head = ["log", "points", "method", "CPU ms", "90 %", "Hz", "times kiss-icp", "m", "°", "% of way"]
+    head = [
+        "log",
+        "points",
+        "method",
+        "CPU ms",
+        "90 %",
+        "Hz",
+        "times kiss-icp",
+        "m",
+        "°",
+        "% of way",
+    ]
     print("\n".join(table(head, rows)))
     print(f"errors over {SPAN} sweeps; one thread; sweeps simulated unless --log is given")
 

@@ -84,9 +84,7 @@ def command(
 
     refuse_over(output, folder_of(log_path))
     refuse_existing(output, overwrite)
-    settings = Settings(
-        method, voxel, leaf, not no_gnss, not no_odometry, not no_loops, reach
-    )
+    settings = Settings(method, voxel, leaf, not no_gnss, not no_odometry, not no_loops, reach)
     builder = Builder(open_log(log_path), settings)
 
     def shown(items: Iterator[Any], what: str, total: int) -> Iterator[Any]:

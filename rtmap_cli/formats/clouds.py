@@ -156,9 +156,10 @@ def write_laz(path: Path, parts: Any, bounds: Array, crs: str) -> None:
         header.add_crs(found)
     with whole_file(path) as temporary:
         compress = path.suffix == ".laz"
-        with Path(temporary).open("wb") as stream, laspy.open(
-            stream, mode="w", header=header, do_compress=compress, closefd=False
-        ) as out:
+        with (
+            Path(temporary).open("wb") as stream,
+            laspy.open(stream, mode="w", header=header, do_compress=compress, closefd=False) as out,
+        ):
             for xyz, intensity in parts:
                 record = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header)
                 record.x, record.y, record.z = xyz.T

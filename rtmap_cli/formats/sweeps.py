@@ -62,9 +62,7 @@ class SweepFolder(FrameLog):
             for k, file in enumerate(files)
         ]
         name = self.folder.resolve().name
-        super().__init__(
-            self.folder, name, local_crs(f"sweeps {name}"), None, frames, notes=notes
-        )
+        super().__init__(self.folder, name, local_crs(f"sweeps {name}"), None, frames, notes=notes)
 
     def read_sweep(self, frame: Frame) -> Array | None:
         """(n, 4) x, y, z (sensor frame, metres) and intensity in [0, 1]; not compensated."""

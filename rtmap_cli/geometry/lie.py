@@ -60,9 +60,7 @@ def log(pose: Array) -> Array:
     w = Rotation.from_matrix(flat[:, :3, :3]).as_rotvec()
     a, b, _ = _terms(np.linalg.norm(w, axis=-1))
     angle2 = (w**2).sum(axis=-1)
-    d = np.where(
-        angle2 < _SMALL, 1 / 12, (1 - a / (2 * b)) / np.where(angle2 < _SMALL, 1, angle2)
-    )
+    d = np.where(angle2 < _SMALL, 1 / 12, (1 - a / (2 * b)) / np.where(angle2 < _SMALL, 1, angle2))
     k = skew(w)
     inverse = np.eye(3) - k / 2 + d[:, None, None] * (k @ k)
     v = (inverse @ flat[:, :3, 3, None])[..., 0]

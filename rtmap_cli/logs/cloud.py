@@ -1,8 +1,8 @@
 """The cloud folder: what ``rtmap label cloud`` writes and the other label commands read.
 
-    cloud.json             CRS, voxel and tile size, the log, how it was made
-    trajectory.parquet     where the vehicle was, how sure that is, what was weak
-    tiles/<i>_<j>.parquet  voxels of the tile [i, i + 1) × [j, j + 1) tile sizes of the map frame
+cloud.json             CRS, voxel and tile size, the log, how it was made
+trajectory.parquet     where the vehicle was, how sure that is, what was weak
+tiles/<i>_<j>.parquet  voxels of the tile [i, i + 1) × [j, j + 1) tile sizes of the map frame
 """
 
 from __future__ import annotations

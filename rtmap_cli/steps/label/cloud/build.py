@@ -227,7 +227,10 @@ class Builder:
     def _said(self, track: Track, reference: Reference, path: Trajectory) -> dict[str, Any]:
         """What cloud.json says."""
         status = track.status
-        counts = {"degenerate": int((status == DEGENERATE).sum()), "lost": int((status == LOST).sum())}
+        counts = {
+            "degenerate": int((status == DEGENERATE).sum()),
+            "lost": int((status == LOST).sum()),
+        }
         if counts["degenerate"]:
             axis = np.nanmean(np.abs(track.weak), axis=0)
             name = ("forward", "sideways", "upward")[int(np.nanargmax(axis))]

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry import lie
 from rtmap_cli.geometry.polylines import arc_length
 from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, wrap_angle, yaw_of
 from rtmap_cli.steps.label.cloud.graph import REJECTED, Edges, Fixes, Solved, solve
+from rtmap_cli.steps.label.cloud.jumps import consistent
 from rtmap_cli.steps.label.cloud.loops import Loop, candidates, verify
 
 if TYPE_CHECKING:
@@ -63,8 +63,9 @@ def place_in_map(
     gnss = np.stack([track.frames[k].map_SE3_ego for k in rows])
     sigma = np.stack([track.frames[k].sigma for k in rows])
     chain = _chain(track, rows)
-    start = _anchored(local, gnss, known)
-    fixes = _fixes(start, gnss, sigma, GNSS_LENGTH) if known else None
+    steady = np.flatnonzero(consistent(local, gnss, sigma)) if known else np.zeros(0, np.int64)
+    start = _anchored(local, gnss, steady)
+    fixes = _fixes(start, gnss, sigma, steady, GNSS_LENGTH) if known else None
     if len(rows) == 1:
         return Reference(start, np.zeros((1, 6, 6)), 0, 0, 0, known)
     solved = solve(start, Edges.of(chain), fixes)
@@ -80,14 +81,16 @@ def place_in_map(
     edges = Edges.of(rows_of)
     if known and fixes is not None:
         length = _alike(solved, start)
-        fixes = _fixes(start, gnss, sigma, length)
+        fixes = _fixes(start, gnss, sigma, steady, length)
     if loops or known:
         solved = solve(solved.pose, edges, fixes)
         rejected_loops = int((solved.edge_weight[edges.doubted] < REJECTED).sum())
-    rejected = int((solved.fix_weight < REJECTED).sum()) if known else 0
+    rejected = 0
+    if known:
+        rejected = len(rows) - len(steady) + int((solved.fix_weight < REJECTED).sum())
     covariance = _in_map(solved)
     if known:
-        covariance[:, :3, :3] += np.eye(3) * _hidden_bias(solved, sigma) ** 2
+        covariance[:, :3, :3] += np.eye(3) * _hidden_bias(solved, sigma[steady]) ** 2
     kept = len(loops) - rejected_loops
     return Reference(solved.pose, covariance, kept, rejected_loops, rejected, known)
 
@@ -98,9 +101,7 @@ def _believable(information: Array) -> Array:
     return np.asarray(np.linalg.inv(covariance))
 
 
-def _chain(
-    track: Track, rows: NDArray[np.int64]
-) -> list[tuple[int, int, Array, Array, bool]]:
+def _chain(track: Track, rows: NDArray[np.int64]) -> list[tuple[int, int, Array, Array, bool]]:
     """Edges from keyframe to keyframe; along what a match does not know the expected motion
     counts, as far as it can be trusted."""
     out = []
@@ -114,27 +115,30 @@ def _chain(
     return out
 
 
-def _anchored(local: Array, gnss: Array, known: bool) -> Array:
-    """The local poses laid over the map: on the first pose of the log, or by the medians over all
-    of yaw and place, which a jump of GNSS does not move."""
-    if not known:
+def _anchored(local: Array, gnss: Array, steady: NDArray[np.int64]) -> Array:
+    """The local poses laid over the map: on the first pose of the log, or by the medians of yaw
+    and place over the ``steady`` fixes."""
+    if not len(steady):
         return np.asarray(gnss[0] @ invert(local[0]) @ local)
-    upright = gnss[0] @ invert(local[0])
-    turn = wrap_angle(yaw_of(gnss) - yaw_of(upright @ local))
+    upright = gnss[steady[0]] @ invert(local[steady[0]])
+    turn = wrap_angle(yaw_of(gnss[steady]) - yaw_of(upright @ local[steady]))
     middle = np.arctan2(np.median(np.sin(turn)), np.median(np.cos(turn)))
     zero = np.array(0.0)
     start = se3_from_xyyaw(zero, zero, np.asarray(middle)) @ upright @ local
-    start[:, :3, 3] += np.median(gnss[:, :3, 3] - start[:, :3, 3], axis=0)
+    start[:, :3, 3] += np.median(gnss[steady, :3, 3] - start[steady, :3, 3], axis=0)
     return np.asarray(start)
 
 
-def _fixes(start: Array, gnss: Array, sigma: Array, length: float) -> Fixes:
+def _fixes(
+    start: Array, gnss: Array, sigma: Array, steady: NDArray[np.int64], length: float
+) -> Fixes:
     """Fixes that count once per ``length`` metres: between, their errors are alike."""
     spacing = np.gradient(arc_length(start[:, :2, 3])) if len(start) > 1 else np.ones(1)
     repeats = np.clip(length / np.maximum(spacing, 0.1), 1.0, None)
     place = np.hypot(sigma[:, 0], sigma[:, 1]) / np.sqrt(2)
     turn = np.maximum(sigma[:, 2], ATTITUDE)
-    return Fixes(np.arange(len(gnss)), gnss, np.stack([place, turn], axis=-1), repeats)
+    both = np.stack([place, turn], axis=-1)
+    return Fixes(steady, gnss[steady], both[steady], repeats[steady])
 
 
 def _alike(solved: Solved, start: Array) -> float:

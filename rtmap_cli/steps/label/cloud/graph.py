@@ -8,7 +8,7 @@ residual down (graduated non-convexity: Yang et al., RA-L 2020).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -72,14 +72,13 @@ class Solved:
     edge_weight: Array
     fix_weight: Array
     fix_residual: Array
-    rounds: int = field(default=0)
 
 
 def solve(start: Array, edges: Edges, fixes: Fixes | None, most_marginals: int = 400) -> Solved:
     """Gauss–Newton over all keyframes; without fixes the first pose stays where it is."""
     pose = start.copy()
     width = np.inf
-    for round_ in range(ROUNDS):
+    for _ in range(ROUNDS):
         r_edge, r_place, r_turn = _residuals(pose, edges, fixes)
         d_edge = np.einsum("ei,eij,ej->e", r_edge, edges.information, r_edge) / 6
         d_fix = np.zeros(0)
@@ -91,16 +90,14 @@ def solve(start: Array, edges: Edges, fixes: Fixes | None, most_marginals: int =
         w_edge = np.where(edges.doubted, _weight(d_edge, width), 1.0)
         w_fix = _weight(d_fix, width)
         shared = w_fix if fixes is None else w_fix / fixes.repeats
-        matrix, gradient = _normal(
-            pose, edges, fixes, (r_edge, r_place, r_turn), w_edge, shared
-        )
+        matrix, gradient = _normal(pose, edges, fixes, (r_edge, r_place, r_turn), w_edge, shared)
         factor = _factored(matrix)
         step = -factor.solve(gradient).reshape(-1, 6)
         pose = pose @ lie.exp(step)
         if np.abs(step).max() < SMALL_STEP and width <= WIDTH:
             break
     covariance = _marginals(factor, len(pose), most_marginals)
-    return Solved(pose, covariance, w_edge, w_fix, r_place, round_ + 1)
+    return Solved(pose, covariance, w_edge, w_fix, r_place)
 
 
 def _weight(d2: Array, width: float) -> Array:

@@ -117,5 +117,3 @@ def _voxels(sums: Array, at: tuple[int, int]) -> Voxels:
     variance = np.maximum(sums[:, 5] / n - mean[:, 2] ** 2, 0.0)
     xyz = mean + (at[0] * TILE, at[1] * TILE, 0.0)
     return Voxels(xyz, sums[:, 6] / n, n, sums[:, 1], np.sqrt(variance))
-
-

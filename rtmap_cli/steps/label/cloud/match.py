@@ -78,9 +78,7 @@ def small_gicp() -> Any:
 def judged(pose: Array, information: Array, inliers: int, error: float, points: int) -> Match:
     """A Match from what a solver says: points without a partner cost `FREE` each."""
     count = max(points, 1)
-    return Match(
-        pose, information, inliers / count, (error + FREE * (points - inliers)) / count
-    )
+    return Match(pose, information, inliers / count, (error + FREE * (points - inliers)) / count)
 
 
 class Vgicp:
@@ -104,9 +102,7 @@ class Vgicp:
 
     def match(self, prepared: Any, guess: Array) -> Match:
         """Gauss–Newton from ``guess``."""
-        r = self._package.align(
-            self._map, prepared, guess, self.voxel, 1, ITERATIONS, 2e-4, 1e-3
-        )
+        r = self._package.align(self._map, prepared, guess, self.voxel, 1, ITERATIONS, 2e-4, 1e-3)
         return judged(r.T_target_source, r.H, r.num_inliers, r.error, prepared.size())
 
     def local_points(self) -> Array:

@@ -122,9 +122,7 @@ class Ndt:
         return self._levels[-1].distributions()[1]
 
 
-def _newton(
-    ready: tuple[Int, Array, Array], size: float, points: Array, pose: Array
-) -> Match:
+def _newton(ready: tuple[Int, Array, Array], size: float, points: Array, pose: Array) -> Match:
     """Gauss–Newton of points (n, 3) against distributions from a pose on."""
     keys, mean, inverse = ready
     for _ in range(ITERATIONS):

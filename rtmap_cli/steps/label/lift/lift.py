@@ -24,6 +24,10 @@ BAND, BAND_SHARE, BAND_MOST = 0.6, 0.12, 2.0
 and at most, which is half of the room under a bridge."""
 
 
+KEPT = 6_000_000
+"""Points of tiles that stay in memory."""
+
+
 @dataclass
 class Lifted:
     """Heights ``z`` (n,) and ``sigma`` (n,) of all vertices, NaN where unknown."""
@@ -42,17 +46,17 @@ def lift(elements: Sequence[Element], cloud: CloudFolder) -> tuple[list[Element]
     z, sigma = np.full(len(xy), np.nan), np.full(len(xy), np.nan)
     known = np.isfinite(reference)
     tile = np.floor(xy / cloud.tile).astype(np.int64)
-    there = set(cloud.tiles())
     rows = np.flatnonzero(known)
     order = rows[np.lexsort((tile[rows, 1], tile[rows, 0]))]
     split = np.flatnonzero((np.diff(tile[order], axis=0) != 0).any(axis=1)) + 1
     near = np.full((len(rows), NEIGHBOURS, 3), np.nan, np.float32)
     done = 0
     groups = np.split(order, split) if len(order) else []
+    source = Near(cloud, xy[rows]) if len(rows) else None
     for group in groups:
+        assert source is not None
         i, j = tile[group[0]].tolist()
-        around = [(a, b) for a in (i - 1, i, i + 1) for b in (j - 1, j, j + 1)]
-        points = _points(cloud, [t for t in around if t in there], xy[group])
+        points = source.about((i, j), xy[group])
         near[done : done + len(group)] = _patches(
             points, xy[group], reference[group], beside[group]
         )
@@ -79,9 +83,7 @@ def _with_heights(element: Element, z: Array, sigma: Array) -> Element:
     return element.with_points(points, covariance)
 
 
-def _references(
-    elements: Sequence[Element], cloud: CloudFolder
-) -> tuple[Array, Array, Array]:
+def _references(elements: Sequence[Element], cloud: CloudFolder) -> tuple[Array, Array, Array]:
     """For every vertex the height of the road driven nearest (NaN: none), metres beside it, and
     the variance of that height."""
     from scipy.spatial import cKDTree
@@ -109,23 +111,53 @@ def _headings(xy: Array) -> Array:
     return np.asarray(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
 
 
-def _points(cloud: CloudFolder, tiles: list[tuple[int, int]], xy: Array) -> Array:
-    """(m, 3) points of the tiles within reach of vertices (n, 2), heights flattened."""
-    low, high = xy.min(axis=0) - RADIUS, xy.max(axis=0) + RADIUS
-    size = np.ceil((high - low) / RADIUS).astype(int) + 2
-    wanted = np.zeros(size, bool)
-    at = np.floor((xy - low) / RADIUS).astype(int)
-    for dx in (-1, 0, 1):
-        for dy in (-1, 0, 1):
-            wanted[tuple(np.clip(at + (dx, dy), 0, size - 1).T)] = True
-    parts = []
-    for tile in tiles:
-        xyz = cloud.read_xyz(*tile)
-        inside = ((xyz[:, :2] >= low) & (xyz[:, :2] < high)).all(axis=1)
-        xyz = xyz[inside]
-        cell = np.floor((xyz[:, :2] - low) / RADIUS).astype(int)
-        parts.append(xyz[wanted[cell[:, 0], cell[:, 1]]])
-    return np.concatenate([*parts, np.zeros((0, 3))])
+class Near:
+    """The points of a cloud that lie near vertices, tile by tile; the last tiles are kept."""
+
+    def __init__(self, cloud: CloudFolder, xy: Array) -> None:
+        self.cloud, self._there = cloud, set(cloud.tiles())
+        cells = np.unique(np.floor(xy / RADIUS).astype(np.int64), axis=0)
+        around = np.array([(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)])
+        self._cells = np.unique((cells[:, None] + around).reshape(-1, 2), axis=0)
+        self._kept: dict[tuple[int, int], Array] = {}
+
+    def about(self, tile: tuple[int, int], xy: Array) -> Array:
+        """(m, 3) points within reach of vertices (n, 2) of one tile."""
+        low, high = xy.min(axis=0) - RADIUS, xy.max(axis=0) + RADIUS
+        first = np.floor(low / self.cloud.tile).astype(int)
+        last = np.floor(high / self.cloud.tile).astype(int)
+        parts = [np.zeros((0, 3))]
+        for i in range(first[0], last[0] + 1):
+            for j in range(first[1], last[1] + 1):
+                points = self._tile((i, j))
+                if (i, j) != tile:
+                    flat = points[:, :2]
+                    points = points[((flat >= low) & (flat <= high)).all(axis=1)]
+                parts.append(points)
+        return np.concatenate(parts)
+
+    def _tile(self, tile: tuple[int, int]) -> Array:
+        if tile not in self._there:
+            return np.zeros((0, 3))
+        if tile not in self._kept:
+            while sum(len(p) for p in self._kept.values()) > KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[tile] = self._read(tile)
+        return self._kept[tile]
+
+    def _read(self, tile: tuple[int, int]) -> Array:
+        xyz = self.cloud.read_xyz(*tile)
+        zero = np.floor(np.array(tile) * self.cloud.tile / RADIUS).astype(np.int64)
+        side = int(np.ceil(self.cloud.tile / RADIUS)) + 2
+        wanted = np.zeros((side, side), bool)
+        inner = self._cells - zero
+        inner = inner[((inner >= 0) & (inner < side)).all(axis=1)]
+        wanted[inner[:, 0], inner[:, 1]] = True
+        # Voxels hold the mean of their points: none lies outside its tile.
+        at = (xyz[:, :2] / RADIUS - zero).astype(np.int64)
+        inside = ((at >= 0) & (at < side)).all(axis=1)
+        at = np.where(inside[:, None], at, 0)
+        return np.asarray(xyz[wanted[at[:, 0], at[:, 1]] & inside])
 
 
 def _patches(points: Array, xy: Array, reference: Array, beside: Array) -> NDArray[np.float32]:

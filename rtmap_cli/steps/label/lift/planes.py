@@ -20,8 +20,9 @@ STEEPEST = 0.25
 LOWER, LOWER_SHARE = 0.06, 0.25
 """A plane this much lower (m) is taken when so many of the points lie on it."""
 FEWEST = 6
-FIRST_GATE, GATES = 0.1, (0.03, 0.12)
-"""Points within this of a plane lie on it (m): at first, and between these by the scatter found."""
+FIRST_GATE, GATE_SCATTERS, GATES = 0.06, 3.0, (0.02, 0.08)
+"""Points within this of a plane lie on it (m): at first; then so many times their scatter, between
+these."""
 TRUST = 0.01
 """Points of one sweep err together: a height is not known better (m)."""
 WIDTH = 1.0
@@ -55,7 +56,7 @@ def heights(near: Array, reference: Array, seed: int = 0) -> Heights:
         points[..., 2] -= reference[part, None]
         if first == 0:
             scatter = _scatter(points, _planes(points, gate, rng), gate)
-            gate = float(np.clip(3.0 * scatter, *GATES))
+            gate = float(np.clip(GATE_SCATTERS * scatter, *GATES))
         z, sigma, support = _fitted(points, _planes(points, gate, rng), gate)
         out.z[part], out.sigma[part], out.support[part] = z + reference[part], sigma, support
     return out
@@ -75,7 +76,9 @@ def _planes(points: Array, gate: float, rng: np.random.Generator) -> Array:
         a = (u[..., 2] * v[..., 1] - v[..., 2] * u[..., 1]) / det
         b = (u[..., 0] * v[..., 2] - v[..., 0] * u[..., 2]) / det
         c = p[:, :, 0, 2] - a * p[:, :, 0, 0] - b * p[:, :, 0, 1]
-    even = np.nanmedian(np.where(known, points[..., 2], np.nan), axis=1)
+    even = np.zeros(m)
+    some = count > 0
+    even[some] = np.nanmedian(np.where(known, points[..., 2], np.nan)[some], axis=1)
     flat = np.stack([np.zeros(m), np.zeros(m), even], axis=-1)
     trial = np.concatenate([np.stack([a, b, c], axis=-1), flat[:, None]], axis=1)
     bad = ~np.isfinite(trial).all(axis=-1) | (np.hypot(trial[..., 0], trial[..., 1]) > STEEPEST)
@@ -106,10 +109,14 @@ def _residual(points: Array, plane: Array) -> Array:
 
 
 def _scatter(points: Array, plane: Array, gate: float) -> float:
-    """Standard deviation of points about their planes, by the median."""
+    """Standard deviation of points about their planes: the lower quartile over the patches, since
+    curbs and bushes scatter too."""
     r = np.abs(_residual(points, plane))
-    r = r[np.isfinite(r) & (r < 2 * gate)]
-    return float(1.4826 * np.median(r)) if len(r) else gate / 3
+    r = np.where(r < 2 * gate, r, np.nan)
+    enough = np.isfinite(r).sum(axis=1) >= FEWEST
+    if not enough.any():
+        return gate / 3
+    return float(1.4826 * np.percentile(np.nanmedian(r[enough], axis=1), 25))
 
 
 def _fitted(points: Array, plane: Array, gate: float) -> tuple[Array, Array, NDArray[np.int64]]:
