@@ -166,6 +166,25 @@ TABLES = {
         "weight": "summed weight of all observations of the cell",
         "frames": "frames that saw it",
     },
+    "rtmap.cloud.trajectory": {
+        **VEHICLE_POSE,
+        "covariance": "36 numbers, row by row: x, y, z (m), rotation about the map's axes (rad)",
+        "ground_z": "height of the road under the ego origin, m; null where unknown",
+        "keyframe": "a node of the pose graph",
+        "status": "ok, degenerate (a direction is not known) or lost (nothing known was met)",
+        "weak_x": "east part of the weak direction; null unless degenerate",
+        "weak_y": "north part of the weak direction",
+        "weak_z": "upward part of the weak direction",
+    },
+    "rtmap.cloud.tile": {
+        "x": "mean of the points in the voxel, east, m",
+        "y": "mean of the points in the voxel, north, m",
+        "z": "mean of the points in the voxel, m",
+        "intensity": "mean intensity, 0 to 1",
+        "count": "points in the voxel",
+        "sweeps": "sweeps that hit it",
+        "spread": "standard deviation of the height of its points, m",
+    },
 }
 
 FILES = {
@@ -183,4 +202,6 @@ FILES = {
     "rtmap.log.sweep": "LOG/lidar/<frame>.parquet",
     "rtmap.semantic.windows": "SEMANTIC/windows.parquet",
     "rtmap.semantic.cells": "SEMANTIC/cells.parquet",
+    "rtmap.cloud.trajectory": "CLOUD/trajectory.parquet",
+    "rtmap.cloud.tile": "CLOUD/tiles/<i>_<j>.parquet",
 }

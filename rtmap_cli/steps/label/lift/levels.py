@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-REACH = 40.0
+REACH = 20.0
 """The ground is known to the trajectory so far beside it (m)."""
 APART = 2.5
 """Heights so far apart (m) are two levels."""
@@ -43,13 +43,16 @@ def samples(position: Array, ground_z: Array, step: float = 1.0) -> tuple[Array,
     return out, np.arctan2(*np.gradient(out[:, :2], axis=0).T[::-1])
 
 
-def offers(xy: Array, heading: Array, path: Array, headings: Array) -> tuple[Array, Array]:
-    """Heights (n, OFFERS) that the trajectory offers each vertex, NaN where fewer, and what each
-    costs: metres away, more when driven across the element."""
+def offers(
+    xy: Array, heading: Array, path: Array, headings: Array
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Heights (n, OFFERS) that the trajectory offers each vertex, NaN where fewer, what each
+    costs (metres away, more when driven across the element) and its sample of the path."""
     from scipy.spatial import cKDTree
 
     if not len(path):
-        return np.full((len(xy), OFFERS), np.nan), np.full((len(xy), OFFERS), np.inf)
+        none = np.full((len(xy), OFFERS), np.nan)
+        return none, np.full(none.shape, np.inf), np.zeros(none.shape, np.int64)
     count = min(ASKED, len(path))
     away, at = cKDTree(path[:, :2]).query(xy, count, distance_upper_bound=REACH)
     away, at = away.reshape(len(xy), count), at.reshape(len(xy), count)
@@ -60,23 +63,24 @@ def offers(xy: Array, heading: Array, path: Array, headings: Array) -> tuple[Arr
     cost = np.where(found, away + CROSSING * np.abs(np.sin(turn)), np.inf)
     heights = np.full((len(xy), OFFERS), np.nan)
     costs = np.full((len(xy), OFFERS), np.inf)
+    source = np.zeros((len(xy), OFFERS), np.int64)
     rows = np.arange(len(xy))
     for k in range(OFFERS):
         best = cost.argmin(axis=1)
-        costs[:, k] = cost[rows, best]
+        costs[:, k], source[:, k] = cost[rows, best], at[rows, best]
         heights[:, k] = np.where(np.isfinite(costs[:, k]), z[rows, best], np.nan)
         with np.errstate(invalid="ignore"):
             same = np.abs(z - heights[:, k : k + 1]) < APART
         cost = np.where(same | ~np.isfinite(z), np.inf, cost)
-    return heights, costs
+    return heights, costs, source
 
 
-def chosen(xy: Array, heights: Array, costs: Array) -> Array:
-    """(n,) the height of each vertex of one element (n, 2) among its offers; NaN without any."""
+def chosen(xy: Array, heights: Array, costs: Array) -> NDArray[np.int64]:
+    """(n,) which offer counts at each vertex of one element (n, 2)."""
     n = len(xy)
     single = ~np.isfinite(costs[:, 1])
     if single.all():
-        return np.asarray(heights[:, 0])
+        return np.zeros(n, np.int64)
     step = np.concatenate([[0.0], np.hypot(*np.diff(xy, axis=0).T)])
     total = np.where(np.isfinite(costs), costs, 1e6)
     filled = np.where(np.isfinite(heights), heights, 0.0)
@@ -86,9 +90,9 @@ def chosen(xy: Array, heights: Array, costs: Array) -> Array:
         through = total[k - 1][:, None] + JUMP * np.maximum(climb, 0.0)
         back[k] = through.argmin(axis=0)
         total[k] = total[k] + through.min(axis=0)
-    out = np.empty(n)
+    out = np.zeros(n, np.int64)
     state = int(total[-1].argmin())
     for k in range(n - 1, -1, -1):
-        out[k] = heights[k, state]
+        out[k] = state
         state = int(back[k, state])
     return out

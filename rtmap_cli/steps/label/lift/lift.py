@@ -8,15 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.logs.cloud import CloudFolder
+from rtmap_cli.logs.cloud import CloudFolder, Trajectory
 from rtmap_cli.maps.element import Element
 from rtmap_cli.steps.label.lift.levels import chosen, offers, samples
 from rtmap_cli.steps.label.lift.planes import heights
 
 Array = NDArray[np.float64]
 
-NEIGHBOURS, RADIUS = 40, 2.5
+NEIGHBOURS, RADIUS = 48, 2.5
 """Points that make a patch, and how far they may be (m)."""
+CELL = np.array([0.25, 0.25, 0.08])
+"""One point is taken of each such cell (m): a patch of neighbours then is wider than curbs are
+high, and places seen often do not outvote the others."""
 FLATTENED = 0.3
 """Heights count so much in the distance of neighbours: a road is flat, a bridge is not near."""
 BAND, BAND_SHARE, BAND_MOST = 0.6, 0.12, 2.0
@@ -24,6 +27,8 @@ BAND, BAND_SHARE, BAND_MOST = 0.6, 0.12, 2.0
 and at most, which is half of the room under a bridge."""
 
 
+FADE = 10.0
+"""The slope under the vehicle is continued so far beside it (m)."""
 KEPT = 6_000_000
 """Points of tiles that stay in memory."""
 
@@ -39,9 +44,10 @@ class Lifted:
 def lift(elements: Sequence[Element], cloud: CloudFolder) -> tuple[list[Element], Lifted]:
     """The elements with heights from the cloud; what is not known stays NaN.
 
-    The height's variance holds the scatter of the plane and the trajectory's own variance there.
+    The height's variance holds the scatter of the plane and the trajectory's own variance, in
+    height and, with the distance, in attitude.
     """
-    reference, beside, variance = _references(elements, cloud)
+    reference, slope, beside, variance = _references(elements, cloud)
     xy = np.concatenate([e.xy for e in elements])
     z, sigma = np.full(len(xy), np.nan), np.full(len(xy), np.nan)
     known = np.isfinite(reference)
@@ -62,7 +68,7 @@ def lift(elements: Sequence[Element], cloud: CloudFolder) -> tuple[list[Element]
         )
         done += len(group)
     if done:
-        found = heights(near.astype(np.float64), reference[order])
+        found = heights(near.astype(np.float64), reference[order], slope[order])
         z[order] = found.z
         sigma[order] = np.sqrt(found.sigma**2 + variance[order])
     out, first = [], 0
@@ -83,27 +89,47 @@ def _with_heights(element: Element, z: Array, sigma: Array) -> Element:
     return element.with_points(points, covariance)
 
 
-def _references(elements: Sequence[Element], cloud: CloudFolder) -> tuple[Array, Array, Array]:
-    """For every vertex the height of the road driven nearest (NaN: none), metres beside it, and
-    the variance of that height."""
+def _references(
+    elements: Sequence[Element], cloud: CloudFolder
+) -> tuple[Array, Array, Array, Array]:
+    """For every vertex a rough height by the road driven nearest (NaN: none) and its slope (n, 2),
+    metres beside it, and the variance of that height."""
     from scipy.spatial import cKDTree
 
     path = cloud.trajectory()
     places, headings = samples(path.pose[:, :3, 3], path.ground_z)
     xy = np.concatenate([e.xy for e in elements])
     heading = np.concatenate([_headings(e.xy) for e in elements])
-    offered, cost = offers(xy, heading, places, headings)
-    reference = np.empty(len(xy))
+    offered, cost, from_ = offers(xy, heading, places, headings)
+    pick = np.empty(len(xy), np.int64)
     first = 0
     for element in elements:
         rows = slice(first, first + len(element.points))
         first = rows.stop
-        reference[rows] = chosen(xy[rows], offered[rows], cost[rows])
+        pick[rows] = chosen(xy[rows], offered[rows], cost[rows])
+    every = np.arange(len(xy))
+    reference, source = offered[every, pick], from_[every, pick]
     if not len(places):
-        return reference, np.full(len(xy), np.inf), np.zeros(len(xy))
-    beside = cKDTree(places[:, :2]).query(xy)[0]
+        return reference, np.zeros((len(xy), 2)), np.full(len(xy), np.inf), np.zeros(len(xy))
+    offset = xy - places[source, :2]
+    slope = _slopes(path)[cKDTree(path.pose[:, :3, 3]).query(places[source])[1]]
+    # A slope is not continued for ever: streets beside a hill's are flatter.
+    away = np.hypot(*offset.T)
+    reference = reference + (slope * offset).sum(axis=1) * np.minimum(1.0, FADE / (away + 1e-9))
     nearest = cKDTree(path.pose[:, :2, 3]).query(xy)[1]
-    return reference, beside, np.maximum(path.covariance[nearest, 2, 2], 0.0)
+    spread = path.covariance[nearest]
+    lean = np.maximum(spread[:, 3, 3], spread[:, 4, 4]) * away**2
+    return reference, slope, away, np.maximum(spread[:, 2, 2] + lean, 0.0)
+
+
+def _slopes(path: Trajectory) -> Array:
+    """(n, 2) slope of the ground under the vehicle as its body leans, m per m east and north: the
+    mean of the sweeps around, since a body pitches on its springs."""
+    from scipy.ndimage import uniform_filter1d
+
+    up = path.pose[:, :3, 2]
+    slope = -up[:, :2] / np.maximum(up[:, 2:], 0.5)
+    return np.asarray(uniform_filter1d(slope, min(7, len(slope)), axis=0, mode="nearest"))
 
 
 def _headings(xy: Array) -> Array:
@@ -157,7 +183,16 @@ class Near:
         at = (xyz[:, :2] / RADIUS - zero).astype(np.int64)
         inside = ((at >= 0) & (at < side)).all(axis=1)
         at = np.where(inside[:, None], at, 0)
-        return np.asarray(xyz[wanted[at[:, 0], at[:, 1]] & inside])
+        return _one_each(xyz[wanted[at[:, 0], at[:, 1]] & inside])
+
+
+def _one_each(xyz: Array) -> Array:
+    """(m, 3) one point of every `CELL`: a voxel's mean is known well enough."""
+    if not len(xyz):
+        return xyz
+    k = np.floor((xyz - xyz.min(axis=0)) / CELL).astype(np.int64)
+    key = (k[:, 2] << 40) | (k[:, 0] << 20) | k[:, 1]
+    return np.asarray(xyz[np.unique(key, return_index=True)[1]])
 
 
 def _patches(points: Array, xy: Array, reference: Array, beside: Array) -> NDArray[np.float32]:

@@ -14,19 +14,21 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-TRIALS = 20
-STEEPEST = 0.25
-"""A ground is not steeper (m per m)."""
-LOWER, LOWER_SHARE = 0.06, 0.25
+TRIALS = 16
+STEEPEST = 0.05
+"""The ground is not steeper than the road driven nearest by more than this (m per m)."""
+LOWER, LOWER_SHARE = 0.05, 0.2
 """A plane this much lower (m) is taken when so many of the points lie on it."""
 FEWEST = 6
-FIRST_GATE, GATE_SCATTERS, GATES = 0.06, 3.0, (0.02, 0.08)
+FIRST_GATE, GATE_SCATTERS, GATES = 0.045, 3.0, (0.02, 0.045)
 """Points within this of a plane lie on it (m): at first; then so many times their scatter, between
-these."""
+these, and less than half of a curb is high, so that no plane lies on both sides of one."""
 TRUST = 0.01
 """Points of one sweep err together: a height is not known better (m)."""
 WIDTH = 1.0
 """Points so far away (m) count about half."""
+LEVELS = np.array([0.05, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8])
+"""Shares of the points below level planes that are tried as well."""
 ROWS = 4096
 
 
@@ -40,11 +42,12 @@ class Heights:
     support: NDArray[np.int64]
 
 
-def heights(near: Array, reference: Array, seed: int = 0) -> Heights:
+def heights(near: Array, reference: Array, slope: Array, seed: int = 0) -> Heights:
     """The ground at n places from the points around them.
 
     ``near`` (n, k, 3): points about each place in x and y (m), heights in the map frame, NaN rows
-    where there are fewer; ``reference`` (n,) a rough height.
+    where there are fewer; ``reference`` (n,) a rough height and ``slope`` (n, 2) a rough
+    slope, m per m.
     """
     rng = np.random.default_rng([seed, 17])
     n = len(near)
@@ -54,6 +57,7 @@ def heights(near: Array, reference: Array, seed: int = 0) -> Heights:
         part = slice(first, first + ROWS)
         points = near[part].copy()
         points[..., 2] -= reference[part, None]
+        points[..., 2] -= (slope[part, None] * points[..., :2]).sum(axis=-1)
         if first == 0:
             scatter = _scatter(points, _planes(points, gate, rng), gate)
             gate = float(np.clip(GATE_SCATTERS * scatter, *GATES))
@@ -76,11 +80,11 @@ def _planes(points: Array, gate: float, rng: np.random.Generator) -> Array:
         a = (u[..., 2] * v[..., 1] - v[..., 2] * u[..., 1]) / det
         b = (u[..., 0] * v[..., 2] - v[..., 0] * u[..., 2]) / det
         c = p[:, :, 0, 2] - a * p[:, :, 0, 0] - b * p[:, :, 0, 1]
-    even = np.zeros(m)
+    level = np.zeros((m, len(LEVELS)))
     some = count > 0
-    even[some] = np.nanmedian(np.where(known, points[..., 2], np.nan)[some], axis=1)
-    flat = np.stack([np.zeros(m), np.zeros(m), even], axis=-1)
-    trial = np.concatenate([np.stack([a, b, c], axis=-1), flat[:, None]], axis=1)
+    level[some] = np.nanquantile(np.where(known, points[..., 2], np.nan)[some], LEVELS, axis=1).T
+    flat = np.stack([np.zeros_like(level), np.zeros_like(level), level], axis=-1)
+    trial = np.concatenate([np.stack([a, b, c], axis=-1), flat], axis=1)
     bad = ~np.isfinite(trial).all(axis=-1) | (np.hypot(trial[..., 0], trial[..., 1]) > STEEPEST)
     trial[bad] = np.nan
     votes = np.zeros(trial.shape[:2], np.int64)
