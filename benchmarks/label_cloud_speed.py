@@ -146,7 +146,14 @@ def simulated(folder: Path, sweeps: int) -> list[Path]:
     out = []
     for lidar in ("vlp16", "os64"):
         words = ["simulate", "lidar", "--map", str(town), "--log", "town:", "--lidar", lidar, "-q"]
-        words += ["--spacing", "1", "--length", str(sweeps), "-o", str(folder / lidar)]
+        words += [
+            "--spacing",
+            "0.8",
+            "--length",
+            str(max(0.8 * sweeps, 25)),
+            "-o",
+            str(folder / lidar),
+        ]
         if run(words):
             sys.exit(3)
         out.append(folder / lidar)

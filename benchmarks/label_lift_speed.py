@@ -78,7 +78,7 @@ def made(folder: Path, points: int, rows: int, length: float) -> None:
 def lines(vertices: int, rows: int, length: float) -> list[Element]:
     """Lines along the streets with so many vertices in all."""
     each = vertices // (4 * rows)
-    out = []
+    out: list[Element] = []
     for k in range(rows):
         for side in (-6.0, -2.0, 2.0, 6.0):
             x = np.linspace(1.0, length - 1.0, each)

@@ -113,7 +113,7 @@ def command(
     quiet: bool,
 ) -> None:
     """Drive through the world of MAP with a spinning LiDAR: a native log of sweeps with the time
-    of every point, rough poses and odometry, the true poses apart in truth/. All of it is simulated.
+    of every point, rough poses and odometry, the true poses apart in truth/. It is all simulated.
 
     The same seeds give the same bytes.
 

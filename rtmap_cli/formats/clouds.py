@@ -64,7 +64,8 @@ def _read_ply(path: Path) -> Columns:
         raise BadInput(path, "is not a PLY file")
     lines = data[:end].decode("ascii").splitlines()
     body = data[data.index(b"\n", end) + 1 :]
-    kind, count, fields, element = "", 0, [], ""
+    kind, count, element = "", 0, ""
+    fields: list[tuple[str, str]] = []
     for line in lines:
         word = line.split()
         if word[:1] == ["format"]:

@@ -332,7 +332,8 @@ class NativeLogWriter:
 
         ``image_times_ns`` gives exposure times where they differ from the frame's; ``sweep``
         (n, 4) holds x, y, z in the ego frame (of ``sweep_time_ns``, by default the frame's) and
-        intensity, or (n, 5) with the time of each point from it (s), in whose ego frame it is; ``masks`` are PNG files of label numbers by camera name. ``frame.images`` and
+        intensity, or (n, 5) with the time of each point from it (s), in whose ego frame it is;
+        ``masks`` are PNG files of label numbers by camera name. ``frame.images`` and
         ``frame.lidar`` are ignored. ValueError when frames do not rise or a camera is unknown.
         """
         if self._rows and (

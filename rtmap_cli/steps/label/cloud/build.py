@@ -18,7 +18,7 @@ from rtmap_cli.logs.cloud import Trajectory, Voxels, write_info, write_tile, wri
 from rtmap_cli.logs.log import Frame, Log
 from rtmap_cli.steps.label.cloud.georeference import Reference, place_in_map
 from rtmap_cli.steps.label.cloud.mapping import TILE, VoxelMap
-from rtmap_cli.steps.label.cloud.odometry import DEGENERATE, LOST, Odometry
+from rtmap_cli.steps.label.cloud.odometry import DEGENERATE, LOST, Odometry, Step
 from rtmap_cli.steps.label.cloud.points import Sweep, cleaned, deskewed, thinned
 
 Array = NDArray[np.float64]
@@ -102,7 +102,8 @@ class Builder:
         """Register every sweep; clouds of keyframes go to ``keys``."""
         settings = self.settings
         odometry = Odometry(settings.method, settings.leaf)
-        steps, frames = [], []
+        steps: list[Step] = []
+        frames: list[Frame] = []
         untimed = 0
         for frame in progress(iter(self.frames), "sweeps", len(self.frames)):
             raw = sweep_of(self.log, frame)

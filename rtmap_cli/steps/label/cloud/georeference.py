@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import arc_length
 from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, wrap_angle, yaw_of
-from rtmap_cli.steps.label.cloud.graph import REJECTED, Edges, Fixes, Solved, solve
+from rtmap_cli.steps.label.cloud.graph import FIXED, REJECTED, Edges, Fixes, Solved, solve
 from rtmap_cli.steps.label.cloud.jumps import consistent
 from rtmap_cli.steps.label.cloud.loops import Loop, candidates, verify
 
@@ -68,7 +68,10 @@ def place_in_map(
     fixes = _fixes(start, gnss, sigma, steady, GNSS_LENGTH) if known else None
     if len(rows) == 1:
         return Reference(start, np.zeros((1, 6, 6)), 0, 0, 0, known)
-    solved = solve(start, Edges.of(chain), fixes)
+    anchor = FIXED
+    if np.isfinite(sigma[0]).all():
+        anchor = (float(sigma[0, :2].max()), max(float(sigma[0, 2]), ATTITUDE))
+    solved = solve(start, Edges.of(chain), fixes, anchor)
     loops: list[Loop] = []
     if settings.loops:
         usual = float(np.median(track.cost[track.cost > 0])) if (track.cost > 0).any() else 1.0
@@ -83,7 +86,7 @@ def place_in_map(
         length = _alike(solved, start)
         fixes = _fixes(start, gnss, sigma, steady, length)
     if loops or known:
-        solved = solve(solved.pose, edges, fixes)
+        solved = solve(solved.pose, edges, fixes, anchor)
         rejected_loops = int((solved.edge_weight[edges.doubted] < REJECTED).sum())
     rejected = 0
     if known:

@@ -25,6 +25,7 @@ WIDTH = 3.0
 """Residuals of more than so many standard deviations lose their vote."""
 SHRINK = 1.6
 SMALL_STEP = 1e-4
+FIXED = (1e-4, 1e-4)
 REJECTED = 0.25
 """A weight below this: the measurement was rejected."""
 
@@ -74,8 +75,15 @@ class Solved:
     fix_residual: Array
 
 
-def solve(start: Array, edges: Edges, fixes: Fixes | None, most_marginals: int = 400) -> Solved:
-    """Gauss–Newton over all keyframes; without fixes the first pose stays where it is."""
+def solve(
+    start: Array,
+    edges: Edges,
+    fixes: Fixes | None,
+    anchor: tuple[float, float] = FIXED,
+    most_marginals: int = 400,
+) -> Solved:
+    """Gauss–Newton over all keyframes; without fixes the first pose stays where it is, known to
+    ``anchor`` (standard deviations of a coordinate, m, and of an angle, rad)."""
     pose = start.copy()
     width = np.inf
     for _ in range(ROUNDS):
@@ -90,7 +98,9 @@ def solve(start: Array, edges: Edges, fixes: Fixes | None, most_marginals: int =
         w_edge = np.where(edges.doubted, _weight(d_edge, width), 1.0)
         w_fix = _weight(d_fix, width)
         shared = w_fix if fixes is None else w_fix / fixes.repeats
-        matrix, gradient = _normal(pose, edges, fixes, (r_edge, r_place, r_turn), w_edge, shared)
+        matrix, gradient = _normal(
+            pose, edges, fixes, (r_edge, r_place, r_turn), w_edge, shared, anchor
+        )
         factor = _factored(matrix)
         step = -factor.solve(gradient).reshape(-1, 6)
         pose = pose @ lie.exp(step)
@@ -128,6 +138,7 @@ def _normal(
     residuals: tuple[Array, Array, Array],
     w_edge: Array,
     w_fix: Array,
+    anchor: tuple[float, float],
 ) -> tuple[Any, Array]:
     """The normal equations: a sparse matrix (6n, 6n) and the gradient (6n,)."""
     from scipy.sparse import coo_matrix
@@ -146,7 +157,9 @@ def _normal(
     np.add.at(gradient, edges.i, (wi @ r_edge[..., None])[..., 0])
     np.add.at(gradient, edges.j, (wj @ r_edge[..., None])[..., 0])
     if fixes is None:
-        blocks.append((np.zeros(1, np.int64), np.zeros(1, np.int64), 1e8 * np.eye(6)[None]))
+        first = np.zeros(1, np.int64)
+        held = np.diag([anchor[1] ** -2.0] * 3 + [anchor[0] ** -2.0] * 3)
+        blocks.append((first, first, held[None]))
     else:
         place, turn = w_fix / fixes.sigma[:, 0] ** 2, w_fix / fixes.sigma[:, 1] ** 2
         h = np.zeros((len(fixes.i), 6, 6))

@@ -144,5 +144,7 @@ def _fitted(points: Array, plane: Array, gate: float) -> tuple[Array, Array, NDA
         spread = (w[good] * r**2).sum(axis=1) / np.maximum(w[good].sum(axis=1), 1e-9)
         inverse = np.linalg.inv(normal[good])[:, 2, 2]
         z[good] = solution[:, 2]
-        sigma[good] = np.sqrt(spread * inverse + TRUST**2)
+        # What the gate cut off: for a normal distribution, to a few per cent.
+        whole = spread / (1.0 - 1.1 * spread / gate**2) ** 2
+        sigma[good] = np.sqrt(whole * inverse + TRUST**2)
     return z, sigma, support
