@@ -95,12 +95,15 @@ def _planes(points: Array, gate: float, rng: np.random.Generator) -> Array:
     votes[bad] = 0
     best = votes.argmax(axis=1)
     rows = np.arange(m)
-    height = trial[rows, best, 2]
-    lower = (trial[..., 2] < height[:, None] - LOWER) & (
-        votes >= np.maximum(LOWER_SHARE * count[:, None], FEWEST)
-    )
-    second = np.where(lower, votes, -1).argmax(axis=1)
-    chosen = np.where(lower.any(axis=1), second, best)
+    taken = np.abs(_residual(filled, trial[rows, best])) < gate
+    # Level planes below it, by the points that it does not explain.
+    own = np.zeros((m, len(LEVELS)), np.int64)
+    for k in range(len(LEVELS)):
+        r = _residual(filled, trial[:, TRIALS + k])
+        own[:, k] = ((np.abs(r) < gate) & ~taken).sum(axis=1)
+    under = trial[:, TRIALS:, 2] < trial[rows, best, 2][:, None] - LOWER
+    own = np.where(under & (own >= np.maximum(LOWER_SHARE * count[:, None], FEWEST)), own, -1)
+    chosen = np.where(own.max(axis=1) > 0, TRIALS + own.argmax(axis=1), best)
     out = trial[rows, chosen]
     out[(votes[rows, chosen] < FEWEST) | (count < FEWEST)] = np.nan
     return np.asarray(out)
