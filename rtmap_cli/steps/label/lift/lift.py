@@ -29,6 +29,8 @@ and at most, which is half of the room under a bridge."""
 
 FADE = 10.0
 """The slope under the vehicle is continued so far beside it (m)."""
+GRID = 1 << 24
+"""Cells of a tile that fit a table."""
 KEPT = 6_000_000
 """Points of tiles that stay in memory."""
 
@@ -190,9 +192,14 @@ def _one_each(xyz: Array) -> Array:
     """(m, 3) one point of every `CELL`: a voxel's mean is known well enough."""
     if not len(xyz):
         return xyz
-    k = np.floor((xyz - xyz.min(axis=0)) / CELL).astype(np.int64)
-    key = (k[:, 2] << 40) | (k[:, 0] << 20) | k[:, 1]
-    return np.asarray(xyz[np.unique(key, return_index=True)[1]])
+    k = ((xyz - xyz.min(axis=0)) / CELL).astype(np.int64)
+    size = k.max(axis=0) + 1
+    key = (k[:, 2] * size[0] + k[:, 0]) * size[1] + k[:, 1]
+    if int(size.prod()) > GRID:
+        return np.asarray(xyz[np.unique(key, return_index=True)[1]])
+    slot = np.full(int(size.prod()), -1, np.int32)
+    slot[key] = np.arange(len(xyz), dtype=np.int32)
+    return np.asarray(xyz[slot[slot >= 0]])
 
 
 def _patches(points: Array, xy: Array, reference: Array, beside: Array) -> NDArray[np.float32]:
