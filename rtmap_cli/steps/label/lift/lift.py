@@ -214,11 +214,11 @@ def _patches(points: Array, xy: Array, reference: Array, beside: Array) -> NDArr
     centre = np.column_stack([xy, FLATTENED * reference])
     count = min(NEIGHBOURS, len(points))
     away, at = tree.query(centre, count, distance_upper_bound=RADIUS)
-    found: NDArray[np.bool_] = np.isfinite(away)
+    found: NDArray[np.bool_] = np.asarray(np.isfinite(away), bool)
     at = np.where(found, at, 0)
     near = points[at] - np.concatenate([xy, np.zeros((len(xy), 1))], axis=1)[:, None]
     band = np.minimum(BAND + BAND_SHARE * beside, BAND_MOST)
-    found = found & (np.abs(near[..., 2] - reference[:, None]) < band[:, None])
+    found &= np.asarray(np.abs(near[..., 2] - reference[:, None]) < band[:, None])
     near[~found] = np.nan
     order = np.argsort(~found, axis=1, kind="stable")
     out[:, :count] = np.take_along_axis(near, order[..., None], axis=1)
