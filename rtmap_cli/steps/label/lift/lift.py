@@ -183,7 +183,7 @@ class Near:
         wanted[inner[:, 0], inner[:, 1]] = True
         # Voxels hold the mean of their points: none lies outside its tile.
         at = (xyz[:, :2] / RADIUS - zero).astype(np.int64)
-        inside = ((at >= 0) & (at < side)).all(axis=1)
+        inside = np.asarray(((at >= 0) & (at < side)).all(axis=1), bool).reshape(-1)
         at = np.where(inside[:, None], at, 0)
         return _one_each(xyz[wanted[at[:, 0], at[:, 1]] & inside])
 
