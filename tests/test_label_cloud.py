@@ -149,7 +149,8 @@ def test_a_tunnel_with_odometry_is_told(rtmap: Call, tmp_path: Path, monkeypatch
     assert np.abs(path.weak[1:, 0]).min() > 0.95
     away = np.linalg.norm(path.pose[:, :3, 3] - path.pose[0, :3, 3], axis=1)
     assert away[-1] == pytest.approx(14.0, abs=0.3)
-    assert path.covariance[-1, 0, 0] > 25 * path.covariance[-1, 1, 1]
+    along = path.covariance[:, 0, 0]
+    assert along[-1] - along[0] > 0.05
 
 
 def test_bad_returns_are_dropped(rtmap: Call, tmp_path: Path, world: Any) -> None:
