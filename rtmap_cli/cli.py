@@ -50,6 +50,7 @@ COMMANDS: dict[str, Any] = {
             "town": ("simulate_town", "A procedural town becomes a map."),
             "changes": ("simulate_changes", "Change a map, with a truth file."),
             "degrade": ("simulate_degrade", "A map less exact than the world: an old survey."),
+            "lidar": ("simulate_lidar", "Drive with a spinning LiDAR: a native log of sweeps."),
             "images": ("simulate_images", "Render the cameras of a drive: a native log."),
             "observations": ("simulate_observations", "Observe a map without a network: a run."),
         },
@@ -66,6 +67,13 @@ COMMANDS: dict[str, Any] = {
             "restore": ("map_restore", "Make an old version the newest one."),
             "validate": ("map_validate", "Check a map folder."),
             "gc": ("map_gc", "Remove files that no kept version needs."),
+        },
+    ),
+    "label": (
+        "Make a first map and training labels from a drive with LiDAR.",
+        {
+            "cloud": ("label_cloud", "Register the sweeps of a log: trajectory and point cloud."),
+            "lift": ("label_lift", "Give the vertices of a map the height of the ground."),
         },
     ),
     "semantic-map": ("semantic_map", "Masks and LiDAR of a log become a raster of the ground."),

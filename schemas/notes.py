@@ -145,6 +145,7 @@ TABLES = {
         "y": "left, m",
         "z": "up, m",
         "intensity": "0 to 1",
+        "time": "s from the time of the sweep; 0 everywhere: motion compensated",
     },
     "rtmap.semantic.windows": VEHICLE_POSE
     | {
@@ -184,6 +185,25 @@ TABLES = {
         "classes": "the same agreement by class",
         "geometry": "WKB polygon: the cell in the map frame",
     },
+    "rtmap.cloud.trajectory": {
+        **VEHICLE_POSE,
+        "covariance": "36 numbers, row by row: x, y, z (m), rotation about the map's axes (rad)",
+        "ground_z": "height of the road under the ego origin, m; null where unknown",
+        "keyframe": "a node of the pose graph",
+        "status": "ok, degenerate (a direction is not known) or lost (nothing known was met)",
+        "weak_x": "east part of the weak direction; null unless degenerate",
+        "weak_y": "north part of the weak direction",
+        "weak_z": "upward part of the weak direction",
+    },
+    "rtmap.cloud.tile": {
+        "x": "mean of the points in the voxel, east, m",
+        "y": "mean of the points in the voxel, north, m",
+        "z": "mean of the points in the voxel, m",
+        "intensity": "mean intensity, 0 to 1",
+        "count": "points in the voxel",
+        "sweeps": "sweeps that hit it",
+        "spread": "standard deviation of the height of its points, m",
+    },
 }
 
 FILES = {
@@ -203,4 +223,6 @@ FILES = {
     "rtmap.semantic.cells": "SEMANTIC/cells.parquet",
     "rtmap.update.heat": "REPORT/heat.parquet",
     "rtmap.update.cells": "REPORT/cells.parquet",
+    "rtmap.cloud.trajectory": "CLOUD/trajectory.parquet",
+    "rtmap.cloud.tile": "CLOUD/tiles/<i>_<j>.parquet",
 }

@@ -165,10 +165,26 @@ class NativeLog:
         return decode_image(frame.images[camera], at_least)
 
     def read_sweep(self, frame: Frame) -> Array | None:
-        """(n, 4) x, y, z (ego, metres) and intensity of the frame's sweep, or None."""
-        return (
-            None if frame.lidar is None else numbers(load(frame.lidar, SWEEP), SWEEP.columns.names)
-        )
+        """(n, 4) x, y, z (ego, metres) and intensity of the frame's sweep, or None; points with
+        times of their own are moved to the sweep's along the odometry."""
+        raw = self.read_raw_sweep(frame)
+        if raw is None or not raw[:, 4].any():
+            return None if raw is None else raw[:, :4]
+        return compensated(raw, self._step_before(frame))
+
+    def read_raw_sweep(self, frame: Frame) -> Array | None:
+        """(n, 5) x, y, z, intensity and time (s from the sweep's) as they were recorded."""
+        if frame.lidar is None:
+            return None
+        return numbers(load(frame.lidar, SWEEP), SWEEP.columns.names)
+
+    def _step_before(self, frame: Frame) -> Array:
+        """(3,) dx, dy, dyaw per second before a frame, zero where odometry is unknown."""
+        row = int(np.flatnonzero(self.index == frame.index)[0])
+        if frame.odometry is None or row == 0:
+            return np.zeros(3)
+        elapsed = float(self.timestamp_ns[row] - self.timestamp_ns[row - 1]) / 1e9
+        return np.asarray(frame.odometry / elapsed, np.float64)
 
     def truth_poses(self) -> Poses | None:
         """True poses that a simulator or a survey laid beside the log, or None."""
@@ -241,6 +257,19 @@ class NativeLog:
             raise BadInput(path, f"frame {min(unknown)} is not in frames.parquet")
 
 
+def compensated(raw: Array, rate: Array) -> Array:
+    """(n, 4) points of a raw sweep (n, 5) in the ego frame of its time, the vehicle moving at the
+    planar ``rate`` (3,) per second: half of a turn's bend is taken as its chord."""
+    yaw = rate[2] * raw[:, 4]
+    c, s = np.cos(yaw), np.sin(yaw)
+    # The chord of the arc driven so far points half of its turn to the side.
+    along, h = raw[:, 4], yaw / 2
+    dx = along * (np.cos(h) * rate[0] - np.sin(h) * rate[1])
+    dy = along * (np.sin(h) * rate[0] + np.cos(h) * rate[1])
+    x, y = raw[:, 0], raw[:, 1]
+    return np.stack([c * x - s * y + dx, s * x + c * y + dy, raw[:, 2], raw[:, 3]], axis=-1)
+
+
 def read_log_info(folder: Path) -> dict[str, Any]:
     """log.json of a native log folder, checked (BadInput says what is missing)."""
     if not folder.is_dir():
@@ -303,7 +332,8 @@ class NativeLogWriter:
 
         ``image_times_ns`` gives exposure times where they differ from the frame's; ``sweep``
         (n, 4) holds x, y, z in the ego frame (of ``sweep_time_ns``, by default the frame's) and
-        intensity; ``masks`` are PNG files of label numbers by camera name. ``frame.images`` and
+        intensity, or (n, 5) with the time of each point from it (s), in whose ego frame it is;
+        ``masks`` are PNG files of label numbers by camera name. ``frame.images`` and
         ``frame.lidar`` are ignored. ValueError when frames do not rise or a camera is unknown.
         """
         if self._rows and (
@@ -326,6 +356,8 @@ class NativeLogWriter:
             path.write_bytes(data)
         if sweep is not None:
             relative = f"lidar/{frame.index:06d}.parquet"
+            if sweep.shape[1] == 4:
+                sweep = np.column_stack([sweep, np.zeros(len(sweep))])
             columns = {n: sweep[:, k] for k, n in enumerate(SWEEP.columns.names)}
             write_table(pa.table(columns), self.folder / relative, SWEEP)
             time = frame.timestamp_ns if sweep_time_ns is None else sweep_time_ns

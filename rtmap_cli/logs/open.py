@@ -17,6 +17,7 @@ READERS = {
     "av2": ("rtmap_cli.formats.av2.log", "Av2Log"),
     "nuscenes": ("rtmap_cli.formats.nuscenes.log", "open_nuscenes"),
     "dgp": ("rtmap_cli.formats.dgp", "DgpLog"),
+    "sweeps": ("rtmap_cli.formats.sweeps", "SweepFolder"),
 }
 """Prefix of a log argument → module and class (or function) of its reader."""
 

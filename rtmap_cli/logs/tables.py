@@ -90,11 +90,15 @@ LIDAR = TableSchema(
 
 SWEEP = TableSchema(
     name="rtmap.log.sweep",
-    version="1.0",
-    frame="ego (x forward, y left, z up) at the time of the sweep, motion compensated",
-    units="metres; intensity in [0, 1]",
-    description="One row per point of one LiDAR sweep.",
-    columns=pa.schema([(n, pa.float32()) for n in ("x", "y", "z", "intensity")]),
+    version="1.1",
+    frame="ego (x forward, y left, z up) at the time of the sweep, or of the point: see time",
+    units="metres; intensity in [0, 1]; seconds",
+    description=(
+        "One row per point of one LiDAR sweep. Where time is 0 everywhere the points are motion "
+        "compensated; otherwise each is in the ego frame of its own time."
+    ),
+    columns=pa.schema([(n, pa.float32()) for n in ("x", "y", "z", "intensity", "time")]),
+    defaults={"time": 0.0},
 )
 
 

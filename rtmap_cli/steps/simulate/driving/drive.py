@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from rtmap_cli.logs.log import Occluder
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.simulate.driving.drives import Drive, drive_over_route, thinned
 from rtmap_cli.steps.simulate.driving.routes import Lane, route_of
+from rtmap_cli.steps.simulate.driving.tours import tour_of
 from rtmap_cli.steps.simulate.perceiving.noise import generator
 from rtmap_cli.steps.simulate.perceiving.perception import DriveKey
 from rtmap_cli.steps.simulate.towns.profiles import STYLES
@@ -80,10 +82,11 @@ def town_drive(
 ) -> Drive:
     """Drive number ``key.traversal`` over the lanes: drives of one world share a corridor.
 
-    ``kind`` is straight or turning; a frame every ``spacing`` metres. NoAnswer when the lanes hold
-    no such route.
+    ``kind`` is straight, turning or tour; a frame every ``spacing`` metres. NoAnswer when the
+    lanes hold no such route.
     """
-    route = route_of(lanes, kind, length, key.world_seed, key.traversal)
+    find = tour_of if kind == "tour" else partial(route_of, kind=kind)
+    route = find(lanes, length_m=length, world_seed=key.world_seed, number=key.traversal)
     rate = TOWN_SPEED / spacing
     name = f"town-{kind}"
     return drive_over_route(name, crs, route, spacing, rate, lateral=0.0, key=key)

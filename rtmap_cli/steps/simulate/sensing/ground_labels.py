@@ -30,8 +30,10 @@ LABELS = (
 """The label list of simulated masks, in Mapillary's names."""
 
 VOID, ROAD, CROSSWALK, MARKING, CURB, SIDEWALK, TERRAIN, SKY, TREE, BUILDING, VEHICLE = range(11)
-PAINTED = 0x80
-"""Bit of a place that is covered with paint, whatever its label."""
+PAINTED, RAISED = 0x80, 0x40
+"""Bits of a place that is covered with paint, or that lies behind the curb, whatever its label."""
+LABEL = 0x3F
+"""The label without them."""
 
 CELL, TILE = 0.05, 512
 """Size of a cell (m), cells along a side of a tile."""
@@ -53,7 +55,7 @@ class GroundLabels:
         return [p.polygon for p in self.world.paint]
 
     def at(self, xy: Array) -> Labels:
-        """(n,) labels (with the bit `PAINTED`) of places (n, 2) in the map frame."""
+        """(n,) labels (with the bits `PAINTED` and `RAISED`) of places (n, 2) in the map frame."""
         ij = np.floor(xy / CELL).astype(np.int64)
         tiles = ij // TILE
         out = np.empty(len(xy), np.uint8)
@@ -105,7 +107,10 @@ class GroundLabels:
             fill(painted, [world.paint[k].polygon], PAINTED)
         for k in crossings:
             fill(labels, [self._crossings[k]], CROSSWALK)
-        out: Labels = labels | painted
+        behind = np.full_like(labels, RAISED)
+        fill(behind, _outer(area), 0)
+        fill(behind, _holes(area), RAISED)
+        out: Labels = labels | painted | behind
         return out
 
 
@@ -122,11 +127,26 @@ def _near(boxes: Array, window: tuple[float, float, float, float]) -> NDArray[np
     )
 
 
+def _outer(area: Any) -> list[Array]:
+    """Outlines of all polygons of an area."""
+    return [np.asarray(p.exterior.coords) for p in _polygons(area)]
+
+
+def _holes(area: Any) -> list[Array]:
+    """Holes of all polygons of an area."""
+    return [np.asarray(r.coords) for p in _polygons(area) for r in p.interiors]
+
+
 def _rings(area: Any) -> list[Array]:
     """Outlines and holes of all polygons of an area."""
     return [
         np.asarray(ring.coords)
-        for part in shapely.get_parts(area)
-        if part.geom_type == "Polygon" and not part.is_empty
+        for part in _polygons(area)
         for ring in (part.exterior, *part.interiors)
     ]
+
+
+def _polygons(area: Any) -> list[Any]:
+    """The polygons of an area that hold something."""
+    parts = shapely.get_parts(area)
+    return [p for p in parts if p.geom_type == "Polygon" and not p.is_empty]

@@ -15,8 +15,8 @@ from rtmap_cli.steps.simulate.images.render_boxes import FACES, clip_near, corne
 from rtmap_cli.steps.simulate.sensing.ground_labels import (
     CROSSWALK,
     CURB,
+    LABEL,
     MARKING,
-    PAINTED,
     ROAD,
     SIDEWALK,
     SKY,
@@ -52,7 +52,7 @@ def draw_mask(ground: GroundLabels, scene: Scene, camera: Camera) -> Mask:
     out = np.where(slope > 0, TERRAIN, SKY).astype(np.uint8)
     near = np.flatnonzero(slope > rise / FARTHEST)
     places = pose[:2, 3] + (rise / slope[near])[:, None] * direction[near, :2]
-    out[near] = ground.at(transform(scene.map_SE3_level, places)) & ~np.uint8(PAINTED)
+    out[near] = ground.at(transform(scene.map_SE3_level, places)) & np.uint8(LABEL)
     mask = out.reshape(camera.height, camera.width)
     for box, kind in zip(scene.boxes, scene.kinds, strict=True):
         if box[6] - box[5] >= FLAT:

@@ -42,16 +42,24 @@ class Scene:
     boxes: Array
     kinds: NDArray[np.uint8]
 
+    def clearance(self, points: Array) -> Array:
+        """(n,) height over the ground of points (n, 3) of the level frame."""
+        if self.terrain is None:
+            return np.asarray(points[:, 2] - self.ground_z)
+        return np.asarray(points[:, 2] - self.terrain.heights(points[:, :2]))
+
     def ground_distance(self, origin: Array, rays: Array) -> Array:
-        """(n,) distance along unit rays (n, 3) from ``origin`` to the ground, inf where there is
-        none within `LAST`."""
+        """(n,) distance along unit rays (n, 3) from ``origin`` (3,) or (n, 3) to the ground, inf
+        where there is none within `LAST`."""
         if self.terrain is None:
             with np.errstate(divide="ignore"):
-                return np.where(rays[:, 2] < 0, (self.ground_z - origin[2]) / rays[:, 2], np.inf)
+                away = (self.ground_z - origin[..., 2]) / rays[:, 2]
+            return np.where(rays[:, 2] < 0, away, np.inf)
         terrain = self.terrain
+        origin = np.broadcast_to(origin, rays.shape)
 
         def over(t: Array, rows: NDArray[np.int64]) -> Array:
-            p = origin + t[:, None] * rays[rows]
+            p = origin[rows] + t[:, None] * rays[rows]
             return np.asarray(p[:, 2] - terrain.heights(p[:, :2]))
 
         out = np.full(len(rays), np.inf)

@@ -1,0 +1,1 @@
+"""A first map from a drive: point cloud, lanes, labels."""

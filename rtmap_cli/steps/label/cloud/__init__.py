@@ -1,0 +1,1 @@
+"""From the sweeps of a log to a trajectory and a point cloud."""

@@ -1,0 +1,1 @@
+"""Heights for the vertices of a map, from the ground of a point cloud."""

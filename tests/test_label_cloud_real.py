@@ -1,0 +1,54 @@
+"""Real sweeps: KITTI, Argoverse 2, Newer College, small_gicp's pair."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("small_gicp")
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def real() -> Any:
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        import label_cloud_real
+
+        return label_cloud_real
+    finally:
+        sys.path.remove(str(BENCHMARKS))
+
+
+def _need(folder: Path) -> None:
+    if not folder.is_dir():
+        pytest.skip(f"{folder.name} not found in RTMAP_DATA")
+
+
+def test_kitti_sweeps_far_apart(real: Any, rtmap_data: Path) -> None:
+    _need(rtmap_data / "lidar_registration")
+    found = real.kitti(rtmap_data, "vgicp")
+    assert found["pair_m"] <= 0.05 and found["pair_deg"] <= 0.15
+    assert found["aligned_m"] <= 0.05
+    ndt = real.kitti(rtmap_data, "ndt")
+    assert ndt["pair_m"] <= 0.05 and ndt["pair_deg"] <= 0.3
+
+
+def test_argoverse_pair(real: Any, av2_log: Path, rtmap_data: Path) -> None:
+    found = real.av2(rtmap_data, "vgicp")
+    assert found["m"] <= 0.03 and found["deg"] <= 0.1
+
+
+def test_newer_college_turns(real: Any, rtmap_data: Path) -> None:
+    _need(rtmap_data / "lidar_registration")
+    found = real.newer(rtmap_data, "-")
+    assert found["raw_m"] > 0.4 and found["m"] < 0.08
+
+
+def test_small_gicp_pair(real: Any, rtmap_data: Path) -> None:
+    _need(rtmap_data / "lidar_registration")
+    found = real.pair(rtmap_data, "vgicp")
+    assert found["m"] <= 0.05 and found["deg"] <= 0.5
