@@ -74,6 +74,7 @@ COMMANDS: dict[str, Any] = {
         {
             "cloud": ("label_cloud", "Register the sweeps of a log: trajectory and point cloud."),
             "lift": ("label_lift", "Give the vertices of a map the height of the ground."),
+            "lanes": ("label_lanes", "Lanes of drives, with borders: a map of lanelets."),
         },
     ),
     "semantic-map": ("semantic_map", "Masks and LiDAR of a log become a raster of the ground."),

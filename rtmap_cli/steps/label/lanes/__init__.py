@@ -1,0 +1,1 @@
+"""Lanes from drives: traces, lanes that they share, a graph of lanelets, their borders."""
