@@ -11,6 +11,7 @@ from rtmap_cli.geometry.polylines import resample_step, tangents
 from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.logs.log import Frame
 from rtmap_cli.logs.native import NativeLogWriter
+from rtmap_cli.logs.run import true_poses
 from rtmap_cli.tables import whole_folder
 
 Array = NDArray[np.float64]
@@ -19,7 +20,7 @@ PLACE = np.array([500_000.0, 5_400_000.0])
 
 
 def write_drive(folder: Path, line: Array, crs: str = CRS, sigma: float = 0.05) -> Path:
-    """A log along a line (n, 2) at 2 m and 0.25 s steps; vertices of the line may repeat (stops)."""
+    """A log along a line (n, 2), a vertex every 0.25 s; vertices may repeat (stops)."""
     pose = np.column_stack([line, np.arctan2(*tangents(line).T[::-1])])
     still = np.hypot(*np.diff(line, axis=0, prepend=line[:1] - 1).T) < 1e-6
     for k in np.flatnonzero(still):
@@ -29,6 +30,9 @@ def write_drive(folder: Path, line: Array, crs: str = CRS, sigma: float = 0.05) 
         for k, (x, y, yaw) in enumerate(pose):
             at = se3_from_xyyaw(x + PLACE[0], y + PLACE[1], yaw)
             writer.add(Frame(k, k * 250_000_000, at, np.array([sigma, sigma, 0.01])), {})
+        at = se3_from_xyyaw(*(pose + [*PLACE, 0.0]).T)
+        frame = np.arange(len(pose))
+        writer.write_truth(true_poses(frame.astype(np.int32), frame * 250_000_000, at))
         writer.close()
     return folder
 

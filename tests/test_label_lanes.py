@@ -93,8 +93,8 @@ def test_stops_and_jumps(rtmap, tmp_path):
     stop = np.repeat(EAST[50:51], 40, axis=0)
     jump = EAST[75:85] + [0.0, 25.0]
     line = np.concatenate([EAST[:50], stop, EAST[50:75], jump, EAST[85:]])
-    said = json.loads(rtmap("label", "lanes", write_drive(tmp_path / "log", line), "-o", tmp_path / "map",
-                 "--json").out)  # fmt: skip
+    log = write_drive(tmp_path / "log", line)
+    said = json.loads(rtmap("label", "lanes", log, "-o", tmp_path / "map", "--json").out)
     assert said["notes"]["poses of stops"] >= 40
     assert said["notes"]["jumps of positions"] >= 2
     xy = np.concatenate([e.xy for e in read_map(tmp_path / "map")]) - PLACE

@@ -27,7 +27,7 @@ UNDER = 2.0
 
 
 def paint_and_curbs(cloud: CloudFolder) -> tuple[Array, NDArray[np.int8], Array]:
-    """Places (n, 2), codes (n,) 1 paint, 2 curb, and weights (n,) of a cloud near its trajectory."""
+    """Places (n, 2), codes (n,) 1 paint, 2 curb, weights (n,) of a cloud near its trajectory."""
     trajectory = cloud.trajectory()
     tree = cKDTree(trajectory.pose[:, :2, 3])
     level = _contrast(cloud, trajectory, tree)

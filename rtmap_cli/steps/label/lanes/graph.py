@@ -176,7 +176,7 @@ class _Cutter:
         near = TOGETHER / STEP
         own = self.strands[k].start if forks else self.strands[k].end
         name: Node = (k, 0 if forks else 1, 0)
-        at = None if own is None else (0 if forks else n - 1)
+        at: int | None = None if own is None else (0 if forks else n - 1)
         for p, j in found:
             if at is None or abs(p - at) > near:
                 at, name = p, (k, 2 if forks else 3, p)
@@ -283,7 +283,7 @@ def _is_change(
         for g in (g for g in enters[e.end] if g != k and g != f):
             kept = _onward(edges, f, leaves, reach, False)
             other = _onward(edges, g, enters, reach, True)
-            feet, gap, at = project(kept, other)
+            _, gap, at = project(kept, other)
             inside = (at > 0) & (at < len(other) - 2)
             beside = inside & (gap > CHANGE[0]) & (gap < CHANGE[1])
             beside &= (tangents(kept) * tangents(other)[at]).sum(axis=1) > 0.95

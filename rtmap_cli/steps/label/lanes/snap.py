@@ -149,7 +149,7 @@ def _lines_only(profile: Array) -> Array:
 
 def _draw(sides: Sides, side: int, profile: Array, bound: float) -> None:
     """One side of one edge drawn to the best path through its profile."""
-    metres = (np.arange(profile.shape[2]) + 0.5) * BIN
+    metres: Array = (np.arange(profile.shape[2], dtype=np.float64) + 0.5) * BIN
     allowed = np.abs(metres - sides.metres[:, side, None]) <= bound
     allowed &= metres >= NEAREST
     score = profile.max(axis=0) * np.clip(1 - FARTHER * (metres - NEAREST), 0, 1)
@@ -210,9 +210,12 @@ def _carried(graph: LaneGraph, sides: list[Sides]) -> list[Sides]:
                 at.setdefault((e.end, side), []).append(float(s.metres[-1, side]))
     for e, s in zip(graph.edges, sides, strict=True):
         for side in (0, 1):
-            ends = [np.mean(at[n, side]) if (n, side) in at else np.nan for n in (e.start, e.end)]
-            if s.kind[:, side].any() or np.isnan(ends).all():
+            first, last = at.get((e.start, side)), at.get((e.end, side))
+            if s.kind[:, side].any() or not (first or last):
                 continue
-            first, last = (np.nanmean(ends) if np.isnan(v) else v for v in ends)
-            s.metres[:, side] = np.linspace(first, last, len(e.xy))
+            s.metres[:, side] = np.linspace(
+                float(np.mean(first or last or 0.0)),
+                float(np.mean(last or first or 0.0)),
+                len(e.xy),
+            )
     return sides

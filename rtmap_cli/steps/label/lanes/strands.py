@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,7 +205,7 @@ class _Walker:
 def _join_ends(out: Strands) -> None:
     """Where a trace went from a strand to another one that begins or ends there, free ends meet."""
     for run in out.runs:
-        for a, b in zip(run[:-1], run[1:], strict=True):
+        for a, b in pairwise(run):
             if a.strand == b.strand and abs(b.at - a.at) < OWN / STEP:
                 continue
             before, after = out.strands[a.strand], out.strands[b.strand]

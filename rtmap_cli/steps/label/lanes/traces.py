@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -229,7 +230,7 @@ def smoothed(track: Track, part: NDArray[np.int64]) -> Array:
     xy, sigma = track.pose[part, :2], np.maximum(track.sigma[part], 0.01)
     steps = np.full((len(part) - 1, 2), np.nan)
     spread = np.full(len(part) - 1, np.nan)
-    for k, (a, b) in enumerate(zip(part[:-1], part[1:], strict=True)):
+    for k, (a, b) in enumerate(pairwise(part)):
         told = track.odometry[a + 1 : b + 1]
         if np.isfinite(told).all():
             steps[k] = _moved(track.pose[a, 2], told)
