@@ -176,7 +176,7 @@ class _Cutter:
         near = TOGETHER / STEP
         own = self.strands[k].start if forks else self.strands[k].end
         name: Node = (k, 0 if forks else 1, 0)
-        at: int | None = None if own is None else (0 if forks else n - 1)
+        at = None if own is None else (0 if forks else n - 1)
         for p, j in found:
             if at is None or abs(p - at) > near:
                 at, name = p, (k, 2 if forks else 3, p)
