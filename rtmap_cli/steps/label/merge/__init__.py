@@ -1,0 +1,1 @@
+"""Edits made by hand, carried over to newly generated labels."""
