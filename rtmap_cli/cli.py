@@ -75,6 +75,8 @@ COMMANDS: dict[str, Any] = {
             "cloud": ("label_cloud", "Register the sweeps of a log: trajectory and point cloud."),
             "lift": ("label_lift", "Give the vertices of a map the height of the ground."),
             "lanes": ("label_lanes", "Lanes of drives, with borders: a map of lanelets."),
+            "merge": ("label_merge", "Bring edits made by hand into newly generated labels."),
+            "frames": ("label_frames", "Cut a labelled drive into logs to train and to test on."),
         },
     ),
     "semantic-map": ("semantic_map", "Masks and LiDAR of a log become a raster of the ground."),
