@@ -126,7 +126,7 @@ def command(
 
 
 def _write(conflicts: list[Conflict], path: Path, crs: str) -> None:
-    """The conflicts as GeoJSON: the line of the edit, and that of the new labels if there is one."""
+    """The conflicts as GeoJSON: the line of the edit, and the new one where there is any."""
     from rtmap_cli.formats.features import feature, write_features
 
     out = []

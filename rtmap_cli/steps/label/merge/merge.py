@@ -56,10 +56,10 @@ def merge_edits(
     drift: float,
     prefer: str,
 ) -> Merged:
-    """``new`` with the edits of ``base``. ``prefer`` ("edited" or "new") says what conflicts become.
+    """``new`` with the edits of ``base``; a conflict takes the side ``prefer`` (edited, new).
 
-    All maps share one CRS. ``tolerance`` (m): smaller edits are none. ``drift`` (m): new lines that
-    differ from the base by less are the same line seen again, and conflict with no edit.
+    All maps share one CRS. ``tolerance`` (m): smaller edits are none. ``drift`` (m): new lines
+    that differ from the base by less are the same line seen again, and conflict with no edit.
     """
     merger = _Merger(base, new, tolerance, drift, prefer == "edited")
     for edit in _agreed(edits, merger.out.conflicts, tolerance):
@@ -259,10 +259,12 @@ class _Merger:
         """Add an element, unless the new labels have it."""
         assert edit.after is not None
         for element in self.elements.values():
-            if element.class_name == edit.after.class_name and element.element_id not in self.base:
-                if displacement(edit.after.points, element.points) <= self.drift:
-                    self.out.counts["already there"] += 1
-                    return
+            alike = element.class_name == edit.after.class_name
+            if not alike or element.element_id in self.base:
+                continue
+            if displacement(edit.after.points, element.points) <= self.drift:
+                self.out.counts["already there"] += 1
+                return
         taken = self.elements.get(edit.element_id)
         if taken is not None and taken.element_id not in self.base:
             self.conflict(
