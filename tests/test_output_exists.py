@@ -27,6 +27,7 @@ WRITERS: dict[str, list[str]] = {
     "simulate degrade": ["--map", NOWHERE],
     "simulate images": ["--map", NOWHERE, "--log", "town:"],
     "simulate observations": ["--map", NOWHERE, "--log", "town:"],
+    "label frames": [NOWHERE, NOWHERE],
     "semantic-map": [NOWHERE],
     "update": [NOWHERE, "--map", NOWHERE],
     "map review": [NOWHERE, "--accept", "some"],
@@ -38,8 +39,11 @@ WRITERS: dict[str, list[str]] = {
 }
 """Arguments with which each verb comes as far as its output."""
 
-PLOTTERS = {"evaluate uncertainty": [NOWHERE, "--poses", NOWHERE, "--plot"]}
-"""Verbs whose only file is a picture that one may ask for; alike, up to the picture's path."""
+PLOTTERS = {
+    "evaluate uncertainty": [NOWHERE, "--poses", NOWHERE, "--plot"],
+    "label merge": [NOWHERE, NOWHERE, "--into", NOWHERE, "--conflicts"],
+}
+"""Verbs whose only file is one that one may ask for; alike, up to the file's path."""
 
 FILES = (
     "detect-changes",

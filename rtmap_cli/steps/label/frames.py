@@ -124,7 +124,7 @@ def apart_split(kind: NDArray[np.int64], xy: Array, ground: Ground, share: float
             continue
         used = train.sum() + test.sum()
         off = sum(abs(test[kind == k].mean() - (1 - share)) for k in np.unique(kind))
-        cost = float(1 - used / len(kind)) + off / len(np.unique(kind))
+        cost = 2 * float(1 - used / len(kind)) + off / len(np.unique(kind))
         if best is None or cost < best[0] - 1e-9:
             best = cost, train, test
     if best is None:
