@@ -41,7 +41,7 @@ WRITERS: dict[str, list[str]] = {
 
 PLOTTERS = {
     "evaluate uncertainty": [NOWHERE, "--poses", NOWHERE, "--plot"],
-    "label merge": [NOWHERE, NOWHERE, "--into", NOWHERE, "--conflicts"],
+    "label merge": [NOWHERE, NOWHERE, "--into", "labels", "--conflicts"],
 }
 """Verbs whose only file is one that one may ask for; alike, up to the file's path."""
 
