@@ -170,8 +170,8 @@ class _Cutter:
         for j, s in enumerate(self.strands):
             spot = s.start if forks else s.end
             if spot is not None and spot[0] == k and len(s.ids) > 1:
-                at = int(np.clip(round(spot[1]) + self.strands[k].ahead, 0, n - 1))
-                found.append((at, j))
+                place = int(np.clip(round(spot[1]) + self.strands[k].ahead, 0, n - 1))
+                found.append((place, j))
         found.sort(reverse=not forks)
         near = TOGETHER / STEP
         own = self.strands[k].start if forks else self.strands[k].end
