@@ -38,7 +38,7 @@ def test_a_construction_zone_from_first_to_last_day(tmp_path: Path) -> None:
     pytest.importorskip("cv2", reason="rendering needs the extra 'simulate'")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     result = subprocess.run(
-        ["bash", str(ROOT / "examples/construction_zone.sh"), str(tmp_path), "40", "2"],
+        ["bash", str(ROOT / "examples/construction_zone.sh"), str(tmp_path), "40", "3"],
         capture_output=True,
         text=True,
         env={**os.environ, "PATH": path},

@@ -118,7 +118,7 @@ class PixelMask:
         distance = np.minimum(self.scene.ground_distance(origin, ray), 200.0)
         hit = origin[:2] + distance[:, None] * ray[:, :2]
         found = self.ground.at(transform(self.scene.map_SE3_level, hit))
-        return np.asarray(found & ~np.uint8(labels.PAINTED))
+        return np.asarray(found & np.uint8(labels.LABEL))
 
 
 def drive_through(lanes: list[Lane], crs: str, key: DriveKey, domain: Domain) -> Drive:
