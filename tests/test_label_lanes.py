@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Result
 from lane_drives import CRS, PLACE, circle, way, write_drive
 
 from rtmap_cli.geometry.polylines import length, project, resample_step
 from rtmap_cli.maps.store import read_map
 from rtmap_cli.steps.simulate.towns.town import make_town
 
+Rtmap = Callable[..., Result]
 EAST = way((0, 0), (200, 0))
 NORTH = way((0, 0), (100, 0), (100, 100))
 
 
-def graph_of(path: Path) -> dict:
+def graph_of(path: Path) -> dict[str, Any]:
     return {f["id"]: f["properties"] for f in json.loads(path.read_text())["features"]}
 
 
-def test_a_drive_becomes_lanelets_of_ten_feet(rtmap, tmp_path):
+def test_a_drive_becomes_lanelets_of_ten_feet(rtmap: Rtmap, tmp_path: Path) -> None:
     log = write_drive(tmp_path / "log", EAST)
     said = json.loads(rtmap("label", "lanes", log, "-o", tmp_path / "map", "--json").out)
     assert said["lanelets"] == 2 and said["forks"] == said["merges"] == 0
@@ -30,7 +34,7 @@ def test_a_drive_becomes_lanelets_of_ten_feet(rtmap, tmp_path):
     assert {round(float(v), 3) for e in borders for v in e.xy[:, 1] - PLACE[1]} == {3.048, -3.048}
 
 
-def test_widths_of_a_stretch(rtmap, tmp_path):
+def test_widths_of_a_stretch(rtmap: Rtmap, tmp_path: Path) -> None:
     log = write_drive(tmp_path / "log", EAST)
     near = tmp_path / "widths.csv"
     near.write_text(f"x,y,radius,left,right\n{PLACE[0] + 50},{PLACE[1]},20,2,4\n")
@@ -41,7 +45,7 @@ def test_widths_of_a_stretch(rtmap, tmp_path):
     assert {3.0, -3.0} <= set(np.round(xy[~inside, 1], 3))
 
 
-def test_passes_that_part_fork(rtmap, tmp_path):
+def test_passes_that_part_fork(rtmap: Rtmap, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     logs = [
         write_drive(tmp_path / f"log{k}", line + rng.normal(0, 0.1, 2))
@@ -59,7 +63,7 @@ def test_passes_that_part_fork(rtmap, tmp_path):
     assert all(s in lanes for p in lanes.values() for s in p["successors"])
 
 
-def test_a_merge_and_both_directions(rtmap, tmp_path):
+def test_a_merge_and_both_directions(rtmap: Rtmap, tmp_path: Path) -> None:
     back = way((200, 3.5), (0, 3.5))
     lines = [EAST, way((100, -100), (100, 0), (200, 0)), back]
     logs = [write_drive(tmp_path / f"log{k}", line) for k, line in enumerate(lines)]
@@ -67,7 +71,7 @@ def test_a_merge_and_both_directions(rtmap, tmp_path):
     assert (said["forks"], said["merges"], said["ends"]) == (0, 1, 2)
 
 
-def test_laps_close_a_loop(rtmap, tmp_path):
+def test_laps_close_a_loop(rtmap: Rtmap, tmp_path: Path) -> None:
     log = write_drive(tmp_path / "log", circle(20.0, 2.3))
     out = tmp_path / "g.geojson"
     said = json.loads(
@@ -78,7 +82,7 @@ def test_laps_close_a_loop(rtmap, tmp_path):
     assert all(len(p["successors"]) == 1 for p in graph_of(out).values())
 
 
-def test_a_change_of_lanes_is_no_lane(rtmap, tmp_path):
+def test_a_change_of_lanes_is_no_lane(rtmap: Rtmap, tmp_path: Path) -> None:
     s = np.linspace(0, 1, 26)[:, None]
     shift = np.column_stack([80 + 50 * s, 3.5 * s**2 * (3 - 2 * s)])
     change = np.concatenate([EAST[:40], shift, [[p, 3.5] for p in range(132, 200, 2)]])
@@ -89,7 +93,7 @@ def test_a_change_of_lanes_is_no_lane(rtmap, tmp_path):
     assert said["lanes_m"] == pytest.approx(400, abs=2)
 
 
-def test_stops_and_jumps(rtmap, tmp_path):
+def test_stops_and_jumps(rtmap: Rtmap, tmp_path: Path) -> None:
     stop = np.repeat(EAST[50:51], 40, axis=0)
     jump = EAST[75:85] + [0.0, 25.0]
     line = np.concatenate([EAST[:50], stop, EAST[50:75], jump, EAST[85:]])
@@ -101,7 +105,7 @@ def test_stops_and_jumps(rtmap, tmp_path):
     assert not ((xy[:, 1] > 4) & (xy[:, 1] < 21)).any()
 
 
-def test_lanelet2_loads_and_routes(rtmap, tmp_path):
+def test_lanelet2_loads_and_routes(rtmap: Rtmap, tmp_path: Path) -> None:
     lanelet2 = pytest.importorskip("lanelet2")
     lines = [EAST, NORTH, way((100, -100), (100, 0), (200, 0))]
     logs = [write_drive(tmp_path / f"log{k}", line) for k, line in enumerate(lines)]
@@ -125,7 +129,7 @@ def test_lanelet2_loads_and_routes(rtmap, tmp_path):
     assert all(graph.getRoute(start, g) is not None for g in goals)
 
 
-def test_borders_come_to_observed_lines(rtmap, tmp_path):
+def test_borders_come_to_observed_lines(rtmap: Rtmap, tmp_path: Path) -> None:
     rtmap("simulate", "town", "--seed", 4, "--size", 300, "-o", tmp_path / "town")
     lane = max(make_town(4, 300.0).lanes, key=length)
     log = write_drive(tmp_path / "log", resample_step(lane[:, :2], 2.0) - PLACE)
@@ -148,13 +152,13 @@ def test_borders_come_to_observed_lines(rtmap, tmp_path):
 
 
 @pytest.mark.parametrize("crs", ["EPSG:32633"])
-def test_sources_of_two_crs_are_refused(rtmap, tmp_path, crs):
+def test_sources_of_two_crs_are_refused(rtmap: Rtmap, tmp_path: Path, crs: str) -> None:
     a, b = write_drive(tmp_path / "a", EAST), write_drive(tmp_path / "b", EAST, crs)
     said = rtmap("label", "lanes", a, b, "-o", tmp_path / "map", code=3)
     assert crs in said.err and CRS in said.err and not (tmp_path / "map").exists()
 
 
-def test_what_is_no_drive_is_refused(rtmap, tmp_path):
+def test_what_is_no_drive_is_refused(rtmap: Rtmap, tmp_path: Path) -> None:
     (tmp_path / "nothing").mkdir()
     rtmap("label", "lanes", tmp_path / "nothing", "-o", tmp_path / "map", code=3)
     parked = write_drive(tmp_path / "parked", np.repeat(EAST[:1], 20, axis=0) + [[0.0, 0.0]])
@@ -168,7 +172,7 @@ def test_what_is_no_drive_is_refused(rtmap, tmp_path):
     assert "no table" in said.err
 
 
-def test_offsets_of_a_tight_curve_do_not_turn_back(rtmap, tmp_path):
+def test_offsets_of_a_tight_curve_do_not_turn_back(rtmap: Rtmap, tmp_path: Path) -> None:
     log = write_drive(tmp_path / "log", way((0, 0), (40, 0), (40, 40), radius=4.0))
     rtmap("label", "lanes", log, "-o", tmp_path / "map", "--width", 4)
     borders = read_map(tmp_path / "map").of_class("boundary")
