@@ -32,6 +32,17 @@ def output(help_text: str, required: bool = True) -> Decorator:
     return click.option("-o", "--output", type=PATH, required=required, help=help_text)
 
 
+def town_length(default: float) -> Decorator:
+    """``--length``: how far to drive through a town (m)."""
+    return click.option(
+        "--length",
+        type=FiniteRange(20),
+        default=default,
+        show_default=True,
+        help="Length of a drive through a town (m).",
+    )
+
+
 overwrite: Decorator = click.option(
     "--overwrite", is_flag=True, help="Replace the output if it exists."
 )
@@ -53,6 +64,17 @@ map_path: Decorator = click.option(
 )
 map_version: Decorator = click.option(
     "--map-version", type=int, help="Version of the map (default: the newest)."
+)
+drive_path: Decorator = click.option(
+    "--log",
+    "log_path",
+    required=True,
+    help="Whose path to drive: av2:LOG_DIR, LOG, or town: (lanes of the town MAP).",
+)
+traffic: Decorator = click.option(
+    "--traffic",
+    type=click.Choice(["log", "generated", "none"]),
+    help="Vehicles [default: the log's boxes, generated where it has none].",
 )
 quiet: Decorator = click.option("-q", "--quiet", is_flag=True, help="No progress on stderr.")
 threads: Decorator = click.option(

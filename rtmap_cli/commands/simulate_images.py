@@ -26,12 +26,7 @@ POSITIVE = options.FiniteRange(0, min_open=True)
 @click.command("images")
 @options.map_path
 @options.map_version
-@click.option(
-    "--log",
-    "log_path",
-    required=True,
-    help="Whose path to drive: av2:LOG_DIR, LOG, or town: (lanes of the town MAP).",
-)
+@options.drive_path
 @options.seed
 @click.option(
     "--world-seed",
@@ -54,13 +49,7 @@ POSITIVE = options.FiniteRange(0, min_open=True)
     show_default=True,
     help="Kind of a drive through a town.",
 )
-@click.option(
-    "--length",
-    type=options.FiniteRange(20),
-    default=160.0,
-    show_default=True,
-    help="Length of a drive through a town (m).",
-)
+@options.town_length(160.0)
 @click.option("--spacing", type=POSITIVE, help="Metres between frames [default: 2.5 in a town].")
 @click.option("--rate", type=POSITIVE, help="Frames per second of a log [default: 2].")
 @click.option("--frames", type=click.IntRange(1), help="At most so many frames [default: all].")
@@ -100,11 +89,7 @@ POSITIVE = options.FiniteRange(0, min_open=True)
 @click.option(
     "--quality", type=click.IntRange(10, 100), default=92, show_default=True, help="JPEG quality."
 )
-@click.option(
-    "--traffic",
-    type=click.Choice(["log", "generated", "none"]),
-    help="Vehicles [default: the log's boxes, generated where it has none].",
-)
+@options.traffic
 @click.option(
     "--change",
     "specs",

@@ -16,12 +16,7 @@ POSITIVE = options.FiniteRange(0, min_open=True)
 @click.command("lidar")
 @options.map_path
 @options.map_version
-@click.option(
-    "--log",
-    "log_path",
-    required=True,
-    help="Whose path to drive: av2:LOG_DIR, LOG, or town: (lanes of the town MAP).",
-)
+@options.drive_path
 @options.seed
 @click.option(
     "--world-seed",
@@ -40,13 +35,7 @@ POSITIVE = options.FiniteRange(0, min_open=True)
     show_default=True,
     help="Kind of a drive through a town; a tour comes back to places that it knows.",
 )
-@click.option(
-    "--length",
-    type=options.FiniteRange(20),
-    default=400.0,
-    show_default=True,
-    help="Length of a drive through a town (m).",
-)
+@options.town_length(400.0)
 @click.option("--spacing", type=POSITIVE, help="Metres between sweeps [default: 2 in a town].")
 @click.option("--rate", type=POSITIVE, help="Sweeps per second of a log [default: 5].")
 @click.option("--frames", type=click.IntRange(1), help="At most so many frames [default: all].")
@@ -80,11 +69,7 @@ POSITIVE = options.FiniteRange(0, min_open=True)
     help="Height of the curbs (m).",
 )
 @click.option("--still", is_flag=True, help="The vehicle stands still while the LiDAR turns.")
-@click.option(
-    "--traffic",
-    type=click.Choice(["log", "generated", "none"]),
-    help="Vehicles [default: the log's boxes, generated where it has none].",
-)
+@options.traffic
 @options.output("The log folder to write.")
 @options.overwrite
 @options.as_json
