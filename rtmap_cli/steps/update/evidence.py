@@ -127,26 +127,59 @@ def seen_of(
 ) -> list[Seen]:
     """What each drive saw of a stretch (n, 2) in the map frame; ``rivals``: other lines (shapely)
     that detections may belong to."""
+    return all_seen([points], class_name, drives, margin, rivals)[0]
+
+
+def all_seen(
+    stretches: Sequence[Array],
+    class_name: str,
+    drives: Sequence[Detected],
+    margin: float,
+    rivals: Any = None,
+) -> list[list[Seen]]:
+    """``seen_of`` for many stretches: frames look for the places of all of them at once."""
     ring = class_name in RING_CLASSES
-    places = points[:-1].mean(axis=0)[None] if ring else resample_step(points, STEP)
+    places = [p[:-1].mean(axis=0)[None] if ring else resample_step(p, STEP) for p in stretches]
+    if not places:
+        return []
+    owner = np.repeat(np.arange(len(places)), [len(p) for p in places])
+    least = np.array([max(min(HALF * len(p), ENOUGH), 1) for p in places])
+    xy = np.concatenate(places)
+    parts = [_seen_by(d, xy, owner, least, RING_NEAR if ring else NEAR, margin, rivals)
+             for d in drives]  # fmt: skip
+    return [[part[k] for part in parts] for k in range(len(places))]
+
+
+def _seen_by(
+    drive: Detected,
+    xy: Array,
+    owner: Int,
+    least: Array,
+    near: float,
+    margin: float,
+    rivals: Any,
+) -> list[Seen]:
+    """What one drive saw of stretches: the places ``xy`` (n, 2) belong to their ``owner`` (n,), of
+    which a frame must have had ``least`` in view."""
+    t = drive.traversal
+    m = len(t.pose)
+    pairs = views(xy, t.pose, t.range_m, t.occluders, margin)
+    key, size = owner[pairs.point] * m + pairs.frame, len(least) * m
+    count = np.bincount(key, minlength=size).reshape(-1, m)
+    hit, at = drive.found(xy[pairs.point], pairs.frame, near, rivals)
+    hits = np.bincount(key, hit, size).reshape(-1, m)
+    scores = np.zeros(size)
+    if hit.any():
+        scores = np.bincount(key[hit], drive.score[at[hit]], size)
+    scores = scores.reshape(-1, m) / np.maximum(hits, 1.0)
     out = []
-    for d in drives:
-        t = d.traversal
-        pairs = views(places, t.pose, t.range_m, t.occluders, margin)
-        count = np.bincount(pairs.frame, minlength=len(t.pose))
-        near = RING_NEAR if ring else NEAR
-        hit, at = d.found(places[pairs.point], pairs.frame, near, rivals)
-        hits = np.bincount(pairs.frame, hit, len(t.pose))
-        looked = np.flatnonzero(count >= max(min(HALF * len(places), ENOUGH), 1))
-        found = hits[looked] >= HALF * count[looked]
-        scores = np.zeros(len(t.pose))
-        if hit.any():
-            total = np.bincount(pairs.frame[hit], d.score[at[hit]], len(t.pose))
-            scores = total / np.maximum(hits, 1.0)
-        scores = np.where(found, scores[looked], 0.0)
-        score = float(scores[found].mean()) if found.any() else None
+    for k, enough in enumerate(least):
+        looked = np.flatnonzero(count[k] >= enough)
+        found = hits[k, looked] >= HALF * count[k, looked]
+        worth = np.where(found, scores[k, looked], 0.0)
+        mean = float(worth[found].mean()) if found.any() else None
         times = t.timestamp_ns[looked]
-        out.append(Seen(t.run_id, times, found, scores, score, int(t.timestamp_ns[0])))
+        out.append(Seen(t.run_id, times, found, worth, mean, int(t.timestamp_ns[0])))
     return out
 
 
@@ -156,8 +189,8 @@ def usual_rate(
     """How often (by score) frames find an element of a class that is there: the upper half of what
     is measured on elements of the map, so that those which are gone do not count."""
     rates = []
-    for e in elements[:: max(1, len(elements) // SAMPLE)]:
-        seen = seen_of(e.xy, class_name, drives, margin)
+    some = [e.xy for e in elements[:: max(1, len(elements) // SAMPLE)]]
+    for seen in all_seen(some, class_name, drives, margin):
         looks = sum(len(s.times) for s in seen)
         if looks >= 4:
             rates.append(sum(float(s.scores.sum()) for s in seen) / looks)
@@ -174,11 +207,11 @@ def aside_rate(
     """How often frames find a line where there is none but one beside it: the tails of its errors,
     measured ``ASIDE`` metres to both sides of lines of the map."""
     found, looks = 0.0, 0
-    for e in elements[:: max(1, len(elements) // SAMPLE)]:
-        places = resample_step(e.xy, STEP)
-        for side in (ASIDE, -ASIDE):
-            for s in seen_of(places + side * normals(places), class_name, drives, margin):
-                found, looks = found + float(s.scores.sum()), looks + len(s.times)
+    lines = [resample_step(e.xy, STEP) for e in elements[:: max(1, len(elements) // SAMPLE)]]
+    beside = [p + side * normals(p) for p in lines for side in (ASIDE, -ASIDE)]
+    for seen in all_seen(beside, class_name, drives, margin):
+        found += sum(float(s.scores.sum()) for s in seen)
+        looks += sum(len(s.times) for s in seen)
     return float(np.clip(found / max(looks, 1), FALSE_RATE, 0.3))
 
 
