@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,23 @@ def write_changes(folder: Path) -> tuple[Path, Path]:
     path = folder / "changes.geojson"
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     return path, folder / "truth.json"
+
+
+def test_a_move_may_be_told_as_one_change() -> None:
+    gone = Change("delete", "divider", line(0, 20), element_id="lane")
+    there = Change("insert", "divider", line(0, 20, 2.0), element_id="lane-new")
+    told = Change("modify", "divider", line(0, 20, 2.3), 0.9, element_id="lane")
+    score = score_changes([told], [gone, there])
+    assert (len(score.found), score.missed, score.false) == (2, [], [])
+    # Of another element, or elsewhere, it is no answer to these.
+    for other in (
+        replace(told, element_id="kerb"),
+        replace(told, points=line(0, 20, 5.0)),
+        replace(told, class_name="boundary"),
+    ):
+        score = score_changes([other], [gone, there])
+        assert (len(score.found), len(score.missed), len(score.false)) == (0, 2, 1)
+    assert len(score_changes([told], [gone]).false) == 1
 
 
 def test_command(rtmap: Any, tmp_path: Path) -> None:

@@ -142,7 +142,9 @@ def score_changes(
     """Match predicted to true changes: same kind, same class, same place; each true one once.
 
     Predictions go by falling probability, each takes the free true change that it fits best; a
-    second prediction of a change already found is false. What lies mostly outside ``area`` (a
+    second prediction of a change already found is false. Where the truth says of an element that
+    moved that it was deleted, and inserted at its new place, a predicted ``modify`` of it that lies
+    there finds both. What lies mostly outside ``area`` (a
     shapely geometry; None: everywhere) is neither right nor wrong.
     """
     inside = [c for c in predicted if area is None or _mostly_inside(c.points, area)]
@@ -159,11 +161,29 @@ def score_changes(
             for t in free
         ]
         best = int(np.argmax(fits)) if fits else -1
+        moved = _moved(change, free)
         if best >= 0 and fits[best] > 0:
             found.append((change, free.pop(best)))
+        elif moved:
+            found += [(change, t) for t in moved]
+            free = [t for t in free if not any(t is m for m in moved)]
         else:
             false.append(change)
     return ChangeScore(found, free, false, outside)
+
+
+def _moved(change: Change, true: Sequence[Change]) -> tuple[Change, ...]:
+    """The true deletion of the element that a prediction modifies, and the true insertion at the
+    place that it modifies it to; nothing where there is none of either."""
+    if change.kind != "modify" or not change.element_id:
+        return ()
+    same = [t for t in true if t.class_name == change.class_name]
+    gone = [t for t in same if t.kind == "delete" and t.element_id == change.element_id]
+    there = [t for t in same if t.kind == "insert"]
+    fits = [same_place(change.points, t.points, t.class_name) for t in there]
+    if not gone or max(fits, default=0.0) <= 0:
+        return ()
+    return gone[0], there[int(np.argmax(fits))]
 
 
 def _mostly_inside(points: Array, area: Any) -> bool:
