@@ -13,6 +13,7 @@ cells that were flagged, before and after. Ends with a line PASS or FAIL for eac
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import sys
@@ -33,6 +34,7 @@ from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import CLASSES, VectorMap
 from rtmap_cli.maps.store import read_map
+from rtmap_cli.steps.evaluate.judge import judge_changes
 from rtmap_cli.steps.evaluate.maps.precision import Scorer
 
 Array = NDArray[np.float64]
@@ -42,6 +44,8 @@ CHANGED_M = 3.0
 OBSERVED = 0.5
 BARS = {"flagged of changed cells": (0.95, 1.0), "flagged of unchanged cells": (0.0, 0.05)}
 AP = 0.8
+EDGES = (0.5, 0.7, 0.9, 0.97, 1.0)
+"""Bins of the told probability."""
 
 
 def judged(world: UpdateWorld, work: Path) -> dict[str, Any]:
@@ -63,6 +67,11 @@ def judged(world: UpdateWorld, work: Path) -> dict[str, Any]:
     out: dict[str, Any] = {"world": world.number, "seconds": seconds, "cells": cells}
     out["told"] = [
         [c["kind"], c["class"], c["reason"], round(c["probability"], 3)] for c in said["changes"]
+    ]
+    out["judged"] = [
+        [c["verdict"], c["probability"]]
+        for c in judge_changes(changes, world.folder / "truth.json")["changes"]
+        if c["verdict"] != "missed"
     ]
     if said["changes"]:
         command("map", "apply", target, changes, "--all")
@@ -152,7 +161,22 @@ def shown(results: Sequence[dict[str, Any]], aps: dict[str, dict[str, float]]) -
     out = [*markdown(header, rows), ""]
     names = [*CLASSES, "mAP"]
     body = [[when, *(f"{ap[n]:.3f}" for n in names)] for when, ap in aps.items()]
-    return [*out, *markdown(["AP in flagged changed cells", *names], body), ""]
+    out += [*markdown(["AP in flagged changed cells", *names], body), ""]
+    return [*out, *markdown(["told probability", "changes", "mean", "real"], reliability(results))]
+
+
+def reliability(results: Sequence[dict[str, Any]]) -> list[list[Any]]:
+    """By bins of the told probability: changes, their mean, and the share that is true (a move is
+    two true changes)."""
+    verdict, told = zip(*(row for r in results for row in r["judged"]), strict=True)
+    real, p = np.array(verdict) == "found", np.array(told)
+    out = []
+    for low, high in itertools.pairwise(EDGES):
+        inside = (p >= low) & ((p < high) | (high == EDGES[-1]))
+        if inside.any():
+            row = [int(inside.sum()), f"{p[inside].mean():.3f}", f"{real[inside].mean():.3f}"]
+            out.append([f"{low:g} to {high:g}", *row])
+    return out
 
 
 def verdicts(results: Sequence[dict[str, Any]], aps: dict[str, dict[str, float]]) -> list[Verdict]:

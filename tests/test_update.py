@@ -17,7 +17,9 @@ from rtmap_cli.geometry.polylines import is_ring, length
 from rtmap_cli.geometry.skeleton import thin, trace
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import read_map, write_new_map
+from rtmap_cli.steps.update.compare import MISSING_OLD, MOVED, Stretch
 from rtmap_cli.steps.update.evidence import Rates
+from rtmap_cli.steps.update.moves import move_odds
 
 Call = Callable[..., Any]
 
@@ -207,6 +209,24 @@ def test_votes_saturate_and_worn_places_are_worn_for_all() -> None:
     rarely = [(2, 14)] * 4
     assert rates.log_odds(rarely) > 0 > rates.log_odds([(0, 14)] * 4)
     assert rates.log_odds([]) == pytest.approx(0.0)
+
+
+def test_lanes_move_together() -> None:
+    def moved(name: str, y: float, by: float, aside: float) -> Stretch:
+        before = np.array([[0.0, y], [30.0, y]])
+        return Stretch(MOVED, "divider", name, before + [0.0, by], before=before, aside=aside)
+
+    little, much = moved("a", 0.0, 0.4, 0.9), moved("b", 3.5, 1.4, 3.0)
+    assert move_odds(little, [little]) < 0 < move_odds(little, [little, much])
+    # Not beside another road's lane, or one that went the other way, or is not sure itself.
+    for other in (
+        moved("b", 40.0, 1.4, 3.0),
+        moved("b", 3.5, -1.4, 3.0),
+        moved("b", 3.5, 0.5, 1.2),
+    ):
+        assert move_odds(little, [little, other]) < 0
+    assert move_odds(much, [much]) > 10
+    assert move_odds(Stretch(MISSING_OLD, "divider", None, much.points), []) == np.inf
 
 
 def test_an_empty_map_gets_everything(fleet: Path, tmp_path: Path, rtmap: Call) -> None:

@@ -57,7 +57,8 @@ OVERLAP, CENTRES = 0.2, 3.0
 class Stretch:
     """What differs: ``reason``, the old element (None: it has none), ``points`` (n, 2) where the
     element lies now (of a missing one: where it lay), the ``confidence`` of the new line, and of a
-    moved one where it lay ``before``."""
+    moved one where it lay ``before`` and how far ``aside`` of that it lies, in limits of what
+    counts."""
 
     reason: str
     class_name: str
@@ -66,6 +67,7 @@ class Stretch:
     confidence: float = 0.0
     drives: float = 0.0
     before: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    aside: float = 0.0
 
 
 def compare(
@@ -191,7 +193,8 @@ def _moved(
                 run = run[np.isfinite(offset[run])]
                 points = a.xy[run] + offset[run, None] * a.normal[run]
                 sure = float(claims.confidence[run].mean())
-                out.append(Stretch(MOVED, name, e.element_id, points, sure, need, a.xy[run]))
+                aside = float(np.mean(side * offset[run] / limit[run]))
+                out.append(Stretch(MOVED, name, e.element_id, points, sure, need, a.xy[run], aside))
     return out
 
 

@@ -168,10 +168,10 @@ def _seen_by(
     count = np.bincount(key, minlength=size).reshape(-1, m)
     hit, at = drive.found(xy[pairs.point], pairs.frame, near, rivals)
     hits = np.bincount(key, hit, size).reshape(-1, m)
-    scores = np.zeros(size)
+    total = np.zeros(size)
     if hit.any():
-        scores = np.bincount(key[hit], drive.score[at[hit]], size)
-    scores = scores.reshape(-1, m) / np.maximum(hits, 1.0)
+        total += np.bincount(key[hit], drive.score[at[hit]], size)
+    scores = total.reshape(-1, m) / np.maximum(hits, 1.0)
     out = []
     for k, enough in enumerate(least):
         looked = np.flatnonzero(count[k] >= enough)

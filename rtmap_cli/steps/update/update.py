@@ -27,6 +27,7 @@ from rtmap_cli.steps.update.compare import (
     compare,
     usual_of,
 )
+from rtmap_cli.steps.update.moves import move_odds
 from rtmap_cli.steps.update.outlines import Line
 from rtmap_cli.steps.update.settings import Settings
 from rtmap_cli.steps.update.vectorise import usual_confidence, vectorise
@@ -110,7 +111,7 @@ def _judged(
         witness = Witnesses(traversals, old.of_class(name), name, claims.get(name), settings)
         for s in mine:
             counts, votes = witness.say(s)
-            event = _event(s, counts, votes)
+            event = _event(s, counts, votes, move_odds(s, stretches))
             agreed = counts.traversals_seen
             if event.kind == "delete":
                 agreed = counts.traversals_in_view - agreed
@@ -120,10 +121,10 @@ def _judged(
     return out
 
 
-def _event(stretch: Stretch, counts: Counts, votes: float) -> ChangeEvent:
-    """A stretch as a change, with what its drives say."""
+def _event(stretch: Stretch, counts: Counts, votes: float, most: float) -> ChangeEvent:
+    """A stretch as a change, with what its drives say; ``most``: its log-odds are no higher."""
     kind = KINDS[stretch.reason]
-    odds = BEFORE[kind] + (-votes if kind == "delete" else votes)
+    odds = min(BEFORE[kind] + (-votes if kind == "delete" else votes), most)
     points = stretch.points
     if stretch.class_name in RING_CLASSES and not is_ring(points):
         points = np.concatenate([points, points[:1]])
