@@ -67,11 +67,18 @@ def offers(
     rows = np.arange(len(xy))
     for k in range(OFFERS):
         best = cost.argmin(axis=1)
-        costs[:, k], source[:, k] = cost[rows, best], at[rows, best]
-        heights[:, k] = np.where(np.isfinite(costs[:, k]), z[rows, best], np.nan)
+        here = np.arange(len(rows))
+        costs[rows, k], source[rows, k] = cost[here, best], at[here, best]
+        first = np.where(np.isfinite(costs[rows, k]), z[here, best], np.nan)
+        heights[rows, k] = first
         with np.errstate(invalid="ignore"):
-            same = np.abs(z - heights[:, k : k + 1]) < APART
-        cost = np.where(same | ~np.isfinite(z), np.inf, cost)
+            other = np.abs(z - first[:, None]) >= APART
+        # Most vertices have one level: only the others are looked at again.
+        more = other.any(axis=1)
+        rows, z, at = rows[more], z[more], at[more]
+        cost = np.where(other[more], cost[more], np.inf)
+        if not len(rows):
+            break
     return heights, costs, source
 
 
