@@ -122,19 +122,21 @@ def _decoded(
     return {n: rows[f"c{k}"].astype(np.float64) for k, (n, _) in enumerate(fields)}
 
 
-def write_ply(path: Path, xyz: Array, intensity: Array, origin: Array, crs: str) -> None:
-    """Binary PLY: x, y, z (float32, m, about ``origin``, which a comment states), intensity."""
+def write_ply(path: Path, parts: Any, count: int, origin: Array, crs: str) -> None:
+    """Binary PLY of ``parts``, an iterable of (xyz (n, 3), intensity (n,)) with ``count`` points in
+    all: x, y, z (float32, m, about ``origin``, which a comment states), intensity."""
     head = (
         "ply\nformat binary_little_endian 1.0\n"
         f"comment crs {' '.join(crs.split())}\n"
         f"comment origin {origin[0]:.3f} {origin[1]:.3f} {origin[2]:.3f}\n"
-        f"element vertex {len(xyz)}\n"
+        f"element vertex {count}\n"
         + "".join(f"property float {n}\n" for n in ("x", "y", "z", "intensity"))
         + "end_header\n"
     )
-    rows = np.column_stack([xyz - origin, intensity]).astype("<f4")
-    with whole_file(path) as temporary:
-        temporary.write_bytes(head.encode() + rows.tobytes())
+    with whole_file(path) as temporary, Path(temporary).open("wb") as stream:
+        stream.write(head.encode())
+        for xyz, intensity in parts:
+            stream.write(np.column_stack([xyz - origin, intensity]).astype("<f4").tobytes())
 
 
 def write_laz(path: Path, parts: Any, bounds: Array, crs: str) -> None:

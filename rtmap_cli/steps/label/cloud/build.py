@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from rtmap_cli.steps.label.cloud.points import Sweep, cleaned, deskewed, thinned
 Array = NDArray[np.float64]
 Progress = Callable[[Iterator[Any], str, int], Iterator[Any]]
 
+NOTHING: Array = np.zeros((0, 3))
 FEWEST = 100
 """A sweep of fewer points is not looked at."""
 MOST_WEAK = 0.5
@@ -121,7 +122,8 @@ class Builder:
             if step.keyframe:
                 thin = thinned(step.points, odometry.matcher_leaf / 2).astype(np.float32)
                 np.save(keys / f"{len(steps)}.npy", thin)
-            steps.append(step)
+            # The points are as large as the log: they are on disk, or not needed any more.
+            steps.append(replace(step, points=NOTHING))
             frames.append(frame)
         if not steps:
             raise BadInput(self.log.path, f"no sweep holds {FEWEST} points within range")

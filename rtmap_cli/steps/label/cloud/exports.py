@@ -34,23 +34,22 @@ def _bounds(cloud: CloudFolder) -> Array:
     return np.stack([low.min(axis=0), high.max(axis=0)])
 
 
+def _parts(cloud: CloudFolder) -> Iterator[tuple[Array, Array]]:
+    """Points and intensities, tile by tile."""
+    for tile in cloud.tiles():
+        voxels = cloud.read_tile(*tile)
+        yield voxels.xyz, voxels.intensity
+
+
 def write_laz_of(cloud: CloudFolder, path: Path) -> None:
     """cloud.laz, tile by tile."""
-
-    def parts() -> Iterator[tuple[Array, Array]]:
-        for tile in cloud.tiles():
-            voxels = cloud.read_tile(*tile)
-            yield voxels.xyz, voxels.intensity
-
-    write_laz(path, parts(), _bounds(cloud), cloud.crs)
+    write_laz(path, _parts(cloud), _bounds(cloud), cloud.crs)
 
 
 def write_ply_of(cloud: CloudFolder, path: Path) -> None:
-    """cloud.ply, float32 about its lower corner."""
-    parts = [cloud.read_tile(*tile) for tile in cloud.tiles()]
-    xyz = np.concatenate([p.xyz for p in parts])
-    light = np.concatenate([p.intensity for p in parts])
-    write_ply(path, xyz, light, np.floor(xyz.min(axis=0)), cloud.crs)
+    """cloud.ply, float32 about its lower corner, tile by tile."""
+    count = sum(len(xyz) for xyz, _ in _parts(cloud))
+    write_ply(path, _parts(cloud), count, np.floor(_bounds(cloud)[0]), cloud.crs)
 
 
 def write_overview(cloud: CloudFolder, path: Path) -> None:

@@ -26,6 +26,8 @@ WIDTH = 3.0
 SHRINK = 1.6
 SMALL_STEP = 1e-4
 FIXED = (1e-4, 1e-4)
+COLUMNS = 2_000_000
+"""Numbers of the inverse that are computed at once."""
 REJECTED = 0.25
 """A weight below this: the measurement was rejected."""
 
@@ -193,8 +195,9 @@ def _marginals(factor: Any, count: int, most: int) -> Array:
     """(n, 6, 6) diagonal blocks of the inverse: at up to ``most`` poses, between them linear."""
     at = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
     found = np.empty((len(at), 6, 6))
-    for first in range(0, len(at), 50):
-        part = at[first : first + 50]
+    together = max(1, COLUMNS // (36 * count))
+    for first in range(0, len(at), together):
+        part = at[first : first + together]
         columns = np.zeros((6 * count, 6 * len(part)))
         for k, a in enumerate(part.tolist()):
             columns[6 * a : 6 * a + 6, 6 * k : 6 * k + 6] = np.eye(6)

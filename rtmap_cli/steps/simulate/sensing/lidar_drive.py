@@ -34,6 +34,8 @@ TURN_S = 0.1
 """Seconds of a turn."""
 SLOTS = 72
 """Moments of a turn at which the vehicle's place is computed."""
+SWAY_S = 0.15
+"""Width (s) of a swing of the body on its springs, which is about 1 Hz."""
 JUMP_S, JUMP_M = 20.0, (5.0, 30.0)
 """Length (s) and size (m) of a stretch where GNSS is off."""
 
@@ -80,9 +82,25 @@ def with_walls(world: World, seed: int) -> World:
 
 def steady(path: Drive, source: Source, key: DriveKey) -> Drive:
     """The drive on its springs, wheels on the ground: the body pitches and rolls."""
-    moved = on_springs(path, source, key).pose.copy()
-    moved[:, :3, 3] = path.pose[:, :3, 3]
-    return replace(path, pose=moved)
+    moved = on_springs(path, source, key)
+    lean = lie.log(invert(path.pose) @ moved.pose)[:, :3]
+    twist = np.zeros((len(path), 6))
+    twist[:, :3] = _swaying(lean, path.timestamp_ns / 1e9)
+    pose = path.pose @ lie.exp(twist)
+    return replace(path, pose=pose)
+
+
+def _swaying(lean: Array, seconds: Array) -> Array:
+    """Angles (n, 3) of independent frames, as large as they were but smooth in time: neighbouring
+    sweeps of a spinning LiDAR show one swing of the body."""
+    middle = lean.mean(axis=0)
+    out = np.empty_like(lean)
+    first = np.searchsorted(seconds, seconds - 4 * SWAY_S)
+    last = np.searchsorted(seconds, seconds + 4 * SWAY_S, "right")
+    for k, (a, b) in enumerate(zip(first, last, strict=True)):
+        w = np.exp(-0.5 * ((seconds[a:b] - seconds[k]) / SWAY_S) ** 2)
+        out[k] = w @ (lean[a:b] - middle) / np.sqrt((w**2).sum())
+    return np.asarray(middle + out)
 
 
 def frames_of_drive(path: Drive, key: DriveKey, recording: Recording) -> Iterator[Frame]:
