@@ -80,9 +80,7 @@ def kiss(sweeps: list[Sweep], times: list[float]) -> tuple[Array, Array]:
 def error_of(poses: Array, truth: Array) -> tuple[float, float]:
     """Mean error of the motion over `SPAN` sweeps: metres, degrees."""
     found, true = poses[WARM:], truth[WARM:]
-    e = lie.log(
-        invert(invert(true[:-SPAN]) @ true[SPAN:]) @ (invert(found[:-SPAN]) @ found[SPAN:])
-    )
+    e = lie.log(invert(invert(true[:-SPAN]) @ true[SPAN:]) @ (invert(found[:-SPAN]) @ found[SPAN:]))
     away = np.linalg.norm(e[:, 3:], axis=1)
     return float(away.mean()), float(np.degrees(np.linalg.norm(e[:, :3], axis=1)).mean())
 
@@ -171,7 +169,18 @@ def main() -> None:
         logs = given.log or simulated(Path(name), given.sweeps)
         for path in logs:
             rows += measured(path.name, NativeLog(path), given.sweeps, given.points)
-    head = ["log", "points", "method", "CPU ms", "90 %", "Hz", "times kiss-icp", "m", "°", "% KITTI"]
+    head = [
+        "log",
+        "points",
+        "method",
+        "CPU ms",
+        "90 %",
+        "Hz",
+        "times kiss-icp",
+        "m",
+        "°",
+        "% KITTI",
+    ]
     print("\n".join(table(head, rows)))
     print(f"m and ° over {SPAN} sweeps; one thread; sweeps simulated unless --log is given")
     if "RTMAP_DATA" in os.environ:

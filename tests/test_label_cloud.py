@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rtmap_cli.geometry import lie
-from rtmap_cli.geometry.poses import invert, transform
+from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, transform
 from rtmap_cli.logs.cloud import CloudFolder
 from rtmap_cli.logs.native import NativeLog
 
@@ -153,6 +153,45 @@ def test_a_tunnel_with_odometry_is_told(rtmap: Call, tmp_path: Path, monkeypatch
     assert along[-1] - along[0] > 0.05
 
 
+def hall(count: int) -> list[np.ndarray]:
+    """Sweeps from the middle of a round hall: nothing tells how the vehicle turned."""
+    rng = np.random.default_rng(6)
+    out = []
+    for _ in range(count):
+        a, b = rng.uniform(0, 2 * np.pi, (2, 5000))
+        r = 12 * np.sqrt(rng.random(5000))
+        wall = np.column_stack([12 * np.cos(a), 12 * np.sin(a), rng.uniform(0, 5, 5000)])
+        floor = np.column_stack([r * np.cos(b), r * np.sin(b), np.zeros(5000)])
+        out.append(np.concatenate([wall, floor]) + rng.normal(0, 0.02, (10_000, 3)))
+    return out
+
+
+@pytest.mark.parametrize("method", ["vgicp", "ndt"])
+def test_a_round_hall_has_no_answer(rtmap: Call, tmp_path: Path, method: str) -> None:
+    folder = cloud_scenes.write_bins(tmp_path / "bins", hall(4))
+    words = ["--method", method, "-o", tmp_path / "c"]
+    err = rtmap("label", "cloud", f"sweeps:{folder}", *words, code=4).err
+    assert "do not tell the turn" in err and not (tmp_path / "c").exists()
+
+
+def test_a_round_hall_with_odometry_is_told(rtmap: Call, tmp_path: Path, monkeypatch: Any) -> None:
+    """The odometry's turn is kept, with the status and a covariance that says so."""
+    yaw = np.radians(6.0) * np.arange(6)
+    poses = se3_from_xyyaw(np.zeros(6), np.zeros(6), yaw)
+    poses[:, :3, 3] += cloud_scenes.ZERO
+    sweeps = iter(hall(6))
+    monkeypatch.setattr(cloud_scenes, "seen", lambda *_: next(sweeps))
+    log = cloud_scenes.write_log(tmp_path / "log", poses, np.zeros((1, 3)), odometry=True)
+    done = rtmap("label", "cloud", log, "--no-gnss", "-q", "-o", tmp_path / "c")
+    assert "do not tell the turn" in done.err
+    path = CloudFolder(tmp_path / "c").trajectory()
+    assert (path.status[1:] == "degenerate").all() and np.isnan(path.weak).all()
+    turned = lie.log(invert(path.pose[0]) @ path.pose[-1])
+    assert np.degrees(turned[2]) == pytest.approx(30.0, abs=1.5)
+    assert np.linalg.norm(turned[3:]) < 0.2
+    assert path.covariance[-1, 5, 5] - path.covariance[0, 5, 5] > 2 * 0.02**2
+
+
 def test_bad_returns_are_dropped(rtmap: Call, tmp_path: Path, world: Any) -> None:
     poses = cloud_scenes.circle(72)[:5]
     rng = np.random.default_rng(3)
@@ -183,7 +222,16 @@ def test_logs_without_sweeps_and_folders_of_nothing(rtmap: Call, tmp_path: Path)
     (folder / "times.txt").write_text("1.0\n0.5\n")
     err = rtmap("label", "cloud", f"sweeps:{folder}", "-o", tmp_path / "x", code=3).err
     assert "out of order" in err
-    (folder / "000000.bin").write_bytes(b"abc")
+    for text, said in (("0\nnan\n", "times.txt"), ("0\n0\n", "out of order"), ("0\n", "2 sweeps")):
+        (folder / "times.txt").write_text(text)
+        err = rtmap("label", "cloud", f"sweeps:{folder}", "-o", tmp_path / "x", code=3).err
+        assert said in err
     (folder / "times.txt").unlink()
+    for text, said in (("1 0 0 0 0 1 0 0 0 0 1 0\n", "1 poses for 2"), ("1 2\n1 2\n", "poses.txt")):
+        (folder / "poses.txt").write_text(text)
+        err = rtmap("label", "cloud", f"sweeps:{folder}", "-o", tmp_path / "x", code=3).err
+        assert said in err
+    (folder / "poses.txt").unlink()
+    (folder / "000000.bin").write_bytes(b"abc")
     err = rtmap("label", "cloud", f"sweeps:{folder}", "-o", tmp_path / "x", code=3).err
     assert "000000.bin" in err

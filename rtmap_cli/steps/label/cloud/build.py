@@ -57,6 +57,15 @@ class Track:
     weak: Array
     keyframe: NDArray[np.bool_]
     cost: Array
+    turn: NDArray[np.bool_]
+
+    def open(self) -> str:
+        """What the sweeps do not tell, in words."""
+        if not np.isfinite(self.weak).any():
+            return "turn" if self.turn.any() else "motion"
+        axis = np.nanmean(np.abs(self.weak), axis=0)
+        way = ("forward", "sideways", "upward")[int(np.nanargmax(axis))]
+        return f"motion {way}" + (", nor the turn" if self.turn.any() else "")
 
 
 def sweep_of(log: Log, frame: Frame) -> Sweep | None:
@@ -141,6 +150,7 @@ class Builder:
             np.stack([nothing if s.weak is None else s.weak for s in steps]),
             np.array([s.keyframe for s in steps]),
             np.array([s.cost for s in steps]),
+            np.array([s.turn for s in steps]),
         )
 
     def _reference(self, track: Track, keys: Path) -> Reference:
@@ -150,11 +160,9 @@ class Builder:
         known = self.settings.gnss and np.isfinite(track.frames[0].sigma).all()
         drives = any(f.odometry is not None for f in track.frames) and self.settings.odometry
         if weak > MOST_WEAK and not known and not drives:
-            axis = np.nanmean(np.abs(track.weak), axis=0)
-            name = ("forward", "sideways", "upward")[int(np.nanargmax(axis))]
             raise NoAnswer(
-                f"the surroundings of {weak:.0%} of the sweeps do not tell the motion {name} "
-                "(a tunnel, or too few returns), and neither GNSS nor odometry does"
+                f"the surroundings of {weak:.0%} of the sweeps do not tell the {track.open()} "
+                "(a tunnel, a round hall, or too few returns), and neither GNSS nor odometry does"
             )
 
         def cloud(k: int) -> Array:
@@ -235,10 +243,8 @@ class Builder:
             "lost": int((status == LOST).sum()),
         }
         if counts["degenerate"]:
-            axis = np.nanmean(np.abs(track.weak), axis=0)
-            name = ("forward", "sideways", "upward")[int(np.nanargmax(axis))]
             self.notes.append(
-                f"{counts['degenerate']} sweeps do not tell the motion {name}: held by what was "
+                f"{counts['degenerate']} sweeps do not tell the {track.open()}: held by what was "
                 "expected there (status degenerate, weak direction in trajectory.parquet)"
             )
         if counts["lost"]:

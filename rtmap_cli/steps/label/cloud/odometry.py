@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry import lie
 from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, transform
-from rtmap_cli.steps.label.cloud.degenerate import held, spectrum, without_weak
+from rtmap_cli.steps.label.cloud.degenerate import (
+    SUSPECT,
+    Spectrum,
+    held,
+    spectrum,
+    turn_is_open,
+    turn_share,
+    without_weak,
+)
 from rtmap_cli.steps.label.cloud.match import Match, Matcher, best_start, make_matcher
 from rtmap_cli.steps.label.cloud.place import starts
 from rtmap_cli.steps.label.cloud.points import Sweep, deskewed, leaf_of
@@ -23,10 +31,13 @@ STILL = 0.05
 """A vehicle that moved less (m) since the last insertion adds nothing to the local map."""
 WORSE = 1.6
 """A match this much costlier than usual is looked for from other starts."""
+SAME, FORGIVEN = 0.3, 0.95
+"""A search that ends so near (m) where it began found the surroundings changed, not the vehicle
+lost: that cost is usual then, for some twenty sweeps (this share of it from sweep to sweep)."""
 LOST_SHARE = 0.3
 """A match with fewer partners is none."""
 SKEW_ROUNDS = 3
-SKEW_DOUBT = 0.02
+SKEW_DOUBT = 0.004
 """Change of the motion (m or rad) that makes taking it out again worthwhile."""
 SEARCH_REACH, SEARCH_YAWS = 25.0, np.radians(np.arange(-60.0, 60.1, 4.0))
 """How far (m) and under which yaws an unexplained sweep is looked for."""
@@ -38,7 +49,8 @@ OK, DEGENERATE, LOST = "ok", "degenerate", "lost"
 class Step:
     """One sweep registered: ``pose`` (4, 4) ego → local frame, ``information`` (6, 6) of the match
     with the local map (zero along what it does not know), ``status``, the ``weak`` direction (3,)
-    of the ego frame (None: all known), ``points`` (n, 3) with the turn's motion taken out."""
+    of the ego frame (None: all known), ``points`` (n, 3) with the turn's motion taken out,
+    ``turn``: the vehicle's turn is not known."""
 
     pose: Array
     information: Array
@@ -48,6 +60,7 @@ class Step:
     points: Array
     share: float
     cost: float
+    turn: bool = False
 
 
 class Odometry:
@@ -64,6 +77,7 @@ class Odometry:
         self._step_s = 0.1
         self._costs: list[float] = []
         self._opening: Sweep | None = None
+        self._tolerated = 0.0
 
     @property
     def matcher_leaf(self) -> float:
@@ -90,7 +104,10 @@ class Odometry:
             prepared = self.matcher.prepare(xyz)
             match = self.matcher.match(prepared, guess)
             if attempt == 0 and self._doubtful(match, known):
-                match = self._search(xyz, prepared, match)
+                first, match = match, self._search(xyz, prepared, match)
+                apart = np.linalg.norm(match.pose[:3, 3] - first.pose[:3, 3])
+                if apart < SAME and match.share >= LOST_SHARE:
+                    self._tolerated = match.cost
             before, twist = twist, lie.log(invert(self._pose) @ match.pose) / elapsed
             span = 0.0 if sweep.time is None else float(np.abs(sweep.time).max(initial=0.0))
             if np.abs(twist - before).max() * span < SKEW_DOUBT:
@@ -130,7 +147,9 @@ class Odometry:
         if not known:
             return True
         usual = float(np.median(self._costs[-30:])) if self._costs else match.cost
-        return match.share < LOST_SHARE or match.cost > WORSE * max(usual, 0.5)
+        self._tolerated *= FORGIVEN
+        limit = WORSE * max(usual, 0.5, self._tolerated)
+        return match.share < LOST_SHARE or match.cost > limit
 
     def _search(self, xyz: Array, prepared: Any, first: Match) -> Match:
         """The best match from places that look alike from above, ``first`` among them."""
@@ -151,14 +170,15 @@ class Odometry:
     ) -> Step:
         """Judge a match and go on from it."""
         known = spectrum(match.information)
+        turn = self._turn_open(match, known, xyz, prepared)
         status, weak, information = OK, None, match.information
         pose = match.pose
         if match.share < LOST_SHARE:
             status, pose, information = LOST, guess, np.zeros((6, 6))
-        elif known.weak.any():
-            status, weak = DEGENERATE, known.directions[:, 0]
-            pose = held(match.pose, guess, known)
-            information = without_weak(information, known)
+        elif known.weak.any() or turn:
+            status, weak = DEGENERATE, known.directions[:, 0] if known.weak.any() else None
+            pose = held(match.pose, guess, known, turn)
+            information = without_weak(information, known, turn)
         if status == OK:
             self._costs.append(match.cost)
             del self._costs[:-30]
@@ -172,7 +192,15 @@ class Odometry:
             self._key = pose
         if status != LOST:
             self._insert(prepared)
-        return Step(pose, information, status, weak, keyframe, xyz, match.share, match.cost)
+        return Step(pose, information, status, weak, keyframe, xyz, match.share, match.cost, turn)
+
+    def _turn_open(self, match: Match, known: Spectrum, xyz: Array, prepared: Any) -> bool:
+        """True when the surroundings do not tell the turn."""
+        assert self.matcher is not None
+        if match.share < LOST_SHARE or turn_share(match.information, known, xyz) > SUSPECT:
+            return False
+        matcher = self.matcher
+        return turn_is_open(lambda start: matcher.match(prepared, start), match)
 
     def _insert(self, prepared: Any) -> None:
         assert self.matcher is not None
