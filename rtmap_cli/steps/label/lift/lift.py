@@ -182,10 +182,12 @@ class Near:
         inner = inner[((inner >= 0) & (inner < side)).all(axis=1)]
         wanted[inner[:, 0], inner[:, 1]] = True
         # Voxels hold the mean of their points: none lies outside its tile.
-        at = (xyz[:, :2] / RADIUS - zero).astype(np.int64)
-        inside = np.asarray(((at >= 0) & (at < side)).all(axis=1), bool).reshape(-1)
-        at = np.where(inside[:, None], at, 0)
-        return _one_each(xyz[wanted[at[:, 0], at[:, 1]] & inside])
+        i = (xyz[:, 0] / RADIUS).astype(np.int64) - zero[0]
+        j = (xyz[:, 1] / RADIUS).astype(np.int64) - zero[1]
+        inside = (i >= 0) & (i < side) & (j >= 0) & (j < side)
+        if not inside.all():
+            xyz, i, j = xyz[inside], i[inside], j[inside]
+        return _one_each(xyz[wanted[i, j]])
 
 
 def _one_each(xyz: Array) -> Array:
