@@ -32,7 +32,7 @@ def test_kitti_sweeps_far_apart(real: Any, rtmap_data: Path) -> None:
     _need(rtmap_data / "lidar_registration")
     found = real.kitti(rtmap_data, "vgicp")
     assert found["pair_m"] <= 0.05 and found["pair_deg"] <= 0.15
-    assert found["aligned_m"] <= 0.05
+    assert found["aligned_m"] <= 0.05 and found["first_deg"] <= 0.15
     ndt = real.kitti(rtmap_data, "ndt")
     assert ndt["pair_m"] <= 0.05 and ndt["pair_deg"] <= 0.3
 
@@ -45,7 +45,7 @@ def test_argoverse_pair(real: Any, av2_log: Path, rtmap_data: Path) -> None:
 def test_newer_college_turns(real: Any, rtmap_data: Path) -> None:
     _need(rtmap_data / "lidar_registration")
     found = real.newer(rtmap_data, "-")
-    assert found["raw_m"] > 0.4 and found["m"] < 0.08
+    assert found["raw_m"] > 0.4 and found["m"] < 0.1 and found["fitted_m"] < 0.05
 
 
 def test_small_gicp_pair(real: Any, rtmap_data: Path) -> None:
