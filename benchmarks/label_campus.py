@@ -2,9 +2,9 @@
 
     python benchmarks/label_campus.py [--seed 4] [--gnss rtk] [--length 3100]
 
-Simulates the town of a seed (roundabout, loops, multi-lane streets, intersections) and a drive of ``--length``
-metres with a VLP-16-like LiDAR and GNSS that jumps three times; registers it without GNSS (loops
-alone) and with it; lifts the town's own map, heights taken away, and compares. Simulated. With
+Simulates the town of a seed (roundabout, loops, multi-lane streets, intersections) and a drive of
+``--length`` metres with a VLP-16-like LiDAR and GNSS that jumps three times; registers it without
+GNSS (loops alone) and with it; lifts the town's own map, heights taken away, and compares. With
 ``--town`` and ``--log`` those are taken (made by the commands that are printed).
 """
 
