@@ -86,7 +86,7 @@ LEAVES = (0.6, 0.7, 0.8, 1.0, 1.25)
 ring, and its surface is not seen."""
 
 
-def leaf_of(xyz: Array, wanted: int = 9000) -> float:
+def leaf_of(xyz: Array, wanted: int = 10_000) -> float:
     """The cell side (m) of `LEAVES` that thins a sweep to ``wanted`` points or fewer."""
     for leaf in LEAVES[:-1]:
         if len(np.unique(cell_keys(xyz, leaf))) <= wanted:
