@@ -1,6 +1,7 @@
-"""Lanelets end where a border changes from paint to curb, or from what was seen to what was not.
+"""Edges of the graph cut into lanelets: where a border changes, and where they are too long.
 
-A way has one type (Lanelet2), so a lanelet is cut where the type of a bound changes for long.
+A way has one type (Lanelet2), so a lanelet ends where a border changes for long from paint to curb,
+or from what was seen to what was not.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.polylines import length
 from rtmap_cli.steps.label.lanes.borders import Sides
 from rtmap_cli.steps.label.lanes.graph import LaneGraph
 from rtmap_cli.steps.label.lanes.traces import STEP
@@ -21,14 +23,19 @@ LEAST = 10.0
 """Metres of a lanelet at least, and of what a border must be to be told apart."""
 
 
-def cut_where_borders_change(
-    graph: LaneGraph, sides: list[Sides]
+def cut_in_lanelets(
+    graph: LaneGraph, sides: list[Sides], longest: float
 ) -> tuple[LaneGraph, list[Sides]]:
-    """The graph with its edges cut where one of their borders is of another kind for ``LEAST``."""
+    """The graph with its edges cut where one of their borders is of another kind for ``LEAST``, and
+    into pieces of at most ``longest`` metres."""
     free = 1 + max((max(e.start, e.end) for e in graph.edges), default=0)
     edges, pieces = [], []
     for e, s in zip(graph.edges, sides, strict=True):
-        marks = [0, *_places(s.kind), len(e.xy) - 1]
+        step = length(e.xy) / max(len(e.xy) - 1, 1)
+        marks = [0]
+        for a, b in pairwise([0, *_places(s.kind), len(e.xy) - 1]):
+            count = max(int(np.ceil((b - a) * step / longest)), 1)
+            marks += np.linspace(a, b, count + 1).round().astype(int).tolist()[1:]
         nodes = [e.start, *range(free, free + len(marks) - 2), e.end]
         free += len(marks) - 2
         for (a, b), (p, q) in zip(pairwise(nodes), pairwise(marks), strict=True):

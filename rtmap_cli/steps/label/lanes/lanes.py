@@ -14,7 +14,7 @@ from rtmap_cli.errors import NoAnswer
 from rtmap_cli.formats.lanelet2.read import Lanelet2Map
 from rtmap_cli.geometry.polylines import length
 from rtmap_cli.steps.label.lanes.borders import KINDS, Borders, Widths, borders_of, sides_of
-from rtmap_cli.steps.label.lanes.cuts import cut_where_borders_change
+from rtmap_cli.steps.label.lanes.cuts import cut_in_lanelets
 from rtmap_cli.steps.label.lanes.graph import LaneGraph, lane_graph
 from rtmap_cli.steps.label.lanes.snap import evidence_of, snapped
 from rtmap_cli.steps.label.lanes.traces import read_traces
@@ -51,13 +51,13 @@ def label_lanes(sources: Sequence[Path], options: LaneOptions) -> LabelledLanes:
     BadInput for sources that cannot be read or lie in several CRSs; NoAnswer without a lane.
     """
     traces, crs, notes = read_traces(sources)
-    graph = lane_graph(traces, options.longest)
+    graph = lane_graph(traces)
     if not graph.edges:
         raise NoAnswer(f"{sources[0]}: no lane was driven")
     sides = sides_of(graph, options.widths)
     for folder in options.snap:
         sides = snapped(graph, sides, evidence_of(folder, crs), options.bound)
-    graph, sides = cut_where_borders_change(graph, sides)
+    graph, sides = cut_in_lanelets(graph, sides, options.longest)
     borders = borders_of(graph, sides)
     lanelets = to_lanelet2(graph, borders, crs, options.limit, bool(options.snap))
     leaves, enters = graph.ends()

@@ -18,7 +18,7 @@ from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.polylines import normals, resample_step
 from rtmap_cli.geometry.poses import transform
 from rtmap_cli.maps.crs import check_same_crs
-from rtmap_cli.steps.label.lanes.borders import Sides
+from rtmap_cli.steps.label.lanes.borders import SAME, Sides
 from rtmap_cli.steps.label.lanes.curbs import paint_and_curbs
 from rtmap_cli.steps.label.lanes.graph import LaneGraph
 from rtmap_cli.steps.label.lanes.traces import STEP
@@ -33,6 +33,10 @@ BLUR = (1.0, 0.06)
 """Metres along and across by which what was seen is blurred."""
 TURNING = 8.0
 """Cost of a metre aside: as much as four metres of line that was clearly seen."""
+JUMP = 4.0
+"""Cost of going on along another line: as much as two metres that were clearly seen."""
+EASED = 2.0
+"""Metres on both sides of such a jump over which the border goes across."""
 STEEPEST = 3
 """Bins by which a border may go aside from sample to sample."""
 FARTHER = 0.2
@@ -46,8 +50,6 @@ REACH = 3.0
 """Metres along by which what was seen holds on both sides: half a gap between dashes."""
 DOUBLE = 8
 """Bins to each side of a line of paint in which its second stripe is looked for."""
-SAME = 0.3
-"""Metres by which a line may go aside over a gap that is bridged."""
 OBSERVED = {"divider": 1, "boundary": 2}
 """KINDS code by class of an observation."""
 
@@ -161,6 +163,8 @@ def _draw(sides: Sides, side: int, profile: Array, bound: float) -> None:
     rows = np.arange(len(path))
     fine = _peak(profile, path, metres)
     seen = _seen(score[rows, path], fine)
+    jumps = np.concatenate([[False], np.abs(np.diff(path)) > STEEPEST])
+    seen &= ~(uniform_filter1d(jumps.astype(float), int(2 * EASED / STEP)) > 1e-9)
     if not seen.any():
         return
     value = np.interp(rows, rows[seen], gaussian_filter1d(fine, 2.0, mode="nearest")[seen])
@@ -201,7 +205,8 @@ def _peak(profile: Array, path: NDArray[np.int64], metres: Array) -> Array:
 
 
 def _best_path(score: Array) -> NDArray[np.int64]:
-    """(n,) bins of the path that collects most, going aside costs TURNING per metre."""
+    """(n,) bins of the path that collects most; going aside costs TURNING per metre, another line
+    JUMP."""
     n, bins = score.shape
     total, back = score[0].copy(), np.zeros((n, bins), np.int64)
     steps = np.arange(-STEEPEST, STEEPEST + 1)
@@ -209,11 +214,15 @@ def _best_path(score: Array) -> NDArray[np.int64]:
     cost = TURNING * BIN * np.abs(steps)
     outside = (from_bin < 0) | (from_bin >= bins)
     index = np.clip(from_bin, 0, bins - 1)
+    rows = np.arange(bins)
     for k in range(1, n):
         options = np.where(outside, -np.inf, total[index] - cost)
         best = options.argmax(axis=1)
-        back[k] = index[np.arange(bins), best]
-        total = options[np.arange(bins), best] + score[k]
+        back[k], near = index[rows, best], options[rows, best]
+        far = int(total.argmax())
+        jumps = near < total[far] - JUMP
+        back[k, jumps] = far
+        total = np.where(jumps, total[far] - JUMP, near) + score[k]
     path = np.zeros(n, np.int64)
     path[-1] = int(total.argmax())
     for k in range(n - 1, 0, -1):
