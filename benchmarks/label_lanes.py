@@ -3,10 +3,10 @@
     python benchmarks/label_lanes.py FOLDER [PLACE...]
 
 ``FOLDER/PLACE`` holds a town, the log of a drive through it with a VLP-16-like LiDAR and the cloud
-registered from it; what is missing is made first (the commands are printed). Vertices are taken from
-the registered to the true pose of the nearest frame: how well the trajectory lies in the world is a
-figure of ``rtmap label cloud``, not of the borders. A vertex could be seen where a true line crosses
-the perpendicular through it between ``NEAREST`` and 10 ft + the bound from the centre line.
+registered from it; what is missing is made first (the commands are printed). Vertices are taken
+from the registered to the true pose of the nearest frame: how well the trajectory lies in the world
+is a figure of ``rtmap label cloud``, not of the borders. A vertex could be seen where a true line
+crosses the perpendicular through it between ``NEAREST`` and 10 ft + the bound from the centre line.
 """
 
 from __future__ import annotations

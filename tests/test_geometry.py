@@ -50,7 +50,7 @@ def test_unknown_heights_stay_unknown() -> None:
 
 
 def test_unknown_heights_far_from_the_origin_of_the_map() -> None:
-    """A vehicle that leans by 3° in UTM: places without a height are where those on its road are."""
+    """A vehicle that leans, in UTM: places without a height are where those on its road are."""
     lean = Rotation.from_euler("ZYX", [40.0, 3.0, -2.0], degrees=True).as_matrix()
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = lean, (500_010.0, 5_400_020.0, 250.0)
