@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# The ring closed: a place without a map. Drives with LiDAR become a cloud and lanes, somebody draws
+# The ring closed: a place without a map. Drives with LiDAR become clouds and lanes, somebody draws
 # the crossings by hand, the labels train a network, the network reads the next drives, and what has
-# changed since comes into the map. Town, sweeps, images and changes are simulated.
+# changed since, or was missing, comes into the map. Town, sweeps, images and changes are simulated.
 #   examples/label_ring.sh OUT [STEPS] [LENGTH_M] [DRIVES] [WIDTH_PX]
+# STEPS 0: without training, the network as it was shipped reads the next drives.
 set -euo pipefail
 out=${1:?usage: label_ring.sh OUT [STEPS] [LENGTH_M] [DRIVES] [WIDTH_PX]}
-steps=${2:-200}
+steps=${2:-40}
 length=${3:-200}
 drives=${4:-4}
 width=${5:-512}
@@ -47,10 +48,14 @@ rtmap label merge "$out/labels.geojson" "$out/edited.geojson" --into "$out/label
 # Labels train a network: lines that were seen, not the widths that were assumed.
 rtmap label frames "$out/labels" "$out"/logs/* "${poses[@]}" --split paper --max-sigma 0.5 -q \
     -o "$out/frames"
-cp -r "$out/frames/map" "$out/first"
-rtmap train -o "$out/weights.pt" --data "$out/frames/paper/train" --map "$out/frames/map" \
-    --init rtmap-tiny --rate 1e-4 --steps "$steps" -q
-rtmap export-model "$out/weights.pt" -o "$out/model.onnx"
+cp -r "$out/frames/map" "$out/map"
+model=rtmap-tiny
+if [ "$steps" -gt 0 ]; then
+  rtmap train -o "$out/weights.pt" --data "$out/frames/paper/train" --map "$out/frames/map" \
+      --init rtmap-tiny --rate 3e-5 --steps "$steps" -q
+  rtmap export-model "$out/weights.pt" -o "$out/model.onnx"
+  model=$out/model.onnx
+fi
 
 # The world goes on without asking: the same ways are driven again and read with that network.
 rtmap simulate changes --map "$out/world" --change delete:ped_crossing --change insert:ped_crossing \
@@ -58,10 +63,27 @@ rtmap simulate changes --map "$out/world" --change delete:ped_crossing --change 
 for k in $(seq "$drives"); do
   rtmap simulate images --map "$out/changed" --log "$out/logs/$k" --seed "$((k + 10))" \
       --width "$width" -q -o "$out/later/$k"
-  rtmap infer "$out/later/$k" --map "$out/first" --model "$out/model.onnx" -q -o "$out/runs/$k"
-  rtmap localize "$out/runs/$k" --map "$out/first" --smooth
+  rtmap infer "$out/later/$k" --map "$out/map" --model "$model" -q -o "$out/runs/$k"
+  rtmap localize "$out/runs/$k" --map "$out/map" --smooth
 done
-rtmap update "$out/runs" --map "$out/frames/map" -o "$out/changes.geojson" --report "$out/report"
+rtmap update "$out/runs" --map "$out/map" -o "$out/changes.geojson" --report "$out/report"
 rtmap map review "$out/changes.geojson" --accept-if 'probability>0.9'
-rtmap map apply "$out/frames/map" "$out/changes.geojson" || echo "nothing to apply"
-rtmap map log "$out/frames/map"
+rtmap map apply "$out/map" "$out/changes.geojson" || echo "nothing to apply"
+rtmap map log "$out/map"
+
+# How good was it? Labels hold the lanes that were driven, the world everything.
+echo "== the network on frames that were not trained on, against the world: before, after"
+test=$out/frames/paper/test/000
+rtmap infer "$test" -q -o "$out/test/before"
+rtmap infer "$test" --model "$model" -q -o "$out/test/after"
+for run in before after; do
+  rtmap evaluate map "$out/test/$run" --truth "$out/world" --poses "$test"
+done
+echo "== a later drive, localized on the labels"
+rtmap evaluate poses "$out/runs/1" --truth "$out/later/1"
+echo "== the two changes of the world (what the labels lacked besides counts as false here)"
+rtmap evaluate changes "$out/changes.geojson" --truth "$out/truth.json"
+echo "== the map against the changed world: before, after"
+for map in "$out/frames/map" "$out/map"; do
+  rtmap evaluate map "$map" --truth "$out/changed" --poses "$out/later/1" --thresholds 1,2,5
+done
