@@ -49,6 +49,19 @@ def test_unknown_heights_stay_unknown() -> None:
     np.testing.assert_allclose(out[0, :2], out[1, :2])
 
 
+def test_unknown_heights_far_from_the_origin_of_the_map() -> None:
+    """A vehicle that leans, in UTM: places without a height are where those on its road are."""
+    lean = Rotation.from_euler("ZYX", [40.0, 3.0, -2.0], degrees=True).as_matrix()
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = lean, (500_010.0, 5_400_020.0, 250.0)
+    road = np.array([[30.0, -12.0, 0.0], [-5.0, 7.0, 0.0]])
+    there = poses.transform(pose, road)
+    unknown = np.array([1.0, 1.0, np.nan])
+    back = poses.transform(poses.invert(pose), there * unknown)
+    np.testing.assert_allclose(back[:, :2], road[:, :2], atol=1e-6)
+    np.testing.assert_allclose(poses.transform(pose, road * unknown)[:, :2], there[:, :2])
+
+
 def test_interpolation_keeps_nanoseconds() -> None:
     start = 1_767_600_000_000_000_000
     times = np.array([start, start + 1000], np.int64)

@@ -81,6 +81,23 @@ def test_lines_that_two_lanes_share_are_learned_once() -> None:
     assert out["longer-0"].points[0, 0] == pytest.approx(100.0, abs=0.5)
 
 
+def test_stretches_that_were_assumed_can_be_left_out() -> None:
+    x = np.arange(0.0, 101.0, 2.0)
+    points = np.column_stack([x, 0 * x])
+    sigma = np.where((x > 30) & (x < 50), 1.5, 0.06)
+    row = np.stack([sigma**2, 0 * x, sigma**2, np.nan * x], axis=-1)
+    half = Element("half", "divider", points, covariance=row)
+    none = Element("none", "boundary", points, covariance=np.tile([2.0, 0.0, 2.0, np.nan], (51, 1)))
+    hand = Element("hand", "divider", points + [0.0, 9.0])
+    moved = Element("moved", "boundary", points + [0.0, 5.0], covariance=np.full((51, 4), np.nan))
+    labels = VectorMap([half, none, hand, moved], "EPSG:32632")
+    out = truth_map(labels, 0.5).by_id()
+    assert set(out) == {"half-s0", "half-s1", "hand", "moved"}
+    assert out["half-s0"].points[-1, 0] == 30.0 and out["half-s1"].points[0, 0] == 50.0
+    assert out["half-s1"].covariance is not None
+    assert set(truth_map(labels).by_id()) == {"half", "none", "hand", "moved"}
+
+
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A town, and the images of a drive of 40 frames through it, small."""

@@ -16,10 +16,12 @@ from rtmap_cli.geometry.blocks import Layout, cells_inside, points_along
 from rtmap_cli.geometry.polylines import is_ring, length
 from rtmap_cli.geometry.skeleton import thin, trace
 from rtmap_cli.maps.element import VectorMap
+from rtmap_cli.maps.evidence import Counts
 from rtmap_cli.maps.store import read_map, write_new_map
 from rtmap_cli.steps.update.compare import MISSING_OLD, MOVED, Stretch
 from rtmap_cli.steps.update.evidence import Rates
 from rtmap_cli.steps.update.moves import move_odds
+from rtmap_cli.steps.update.update import _event, _named_apart
 
 Call = Callable[..., Any]
 
@@ -237,3 +239,17 @@ def test_an_empty_map_gets_everything(fleet: Path, tmp_path: Path, rtmap: Call) 
     )  # fmt: skip
     assert {c["kind"] for c in said["changes"]} == {"insert"}
     assert {c["class"] for c in said["changes"]} == {"ped_crossing", "divider", "boundary"}
+
+
+def test_changes_in_the_same_metre_have_names_of_their_own() -> None:
+    """Two stretches may have their middles in one metre; a file of changes refuses twin names."""
+    ring = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 6.0], [0.0, 6.0]])
+    stretches = [
+        Stretch(MISSING_OLD, name, None, ring + shift)
+        for name, shift in (("divider", 0.0), ("divider", 0.1), ("boundary", 0.0))
+    ]
+    counts = Counts(traversals_seen=2, traversals_in_view=2)
+    told = _named_apart([(s, _event(s, counts, 3.0, 9.0)) for s in stretches])
+    names = [e.change_id for _, e in told]
+    assert len(set(names)) == 3 and names[1] == f"{names[0]}-1"
+    assert [s for s, _ in told] == stretches

@@ -41,6 +41,12 @@ if TYPE_CHECKING:
     show_default=True,
     help="Share of the frames that train.",
 )
+@click.option(
+    "--max-sigma",
+    type=options.FiniteRange(0, min_open=True),
+    help="Leave out stretches of lines whose place is less sure (m): borders that `label lanes` "
+    "assumed [default: all are labels].",
+)
 @options.seed
 @options.output("The folder to write.")
 @options.overwrite
@@ -52,6 +58,7 @@ def command(
     poses: tuple[Path, ...],
     splits: tuple[str, ...],
     share: float,
+    max_sigma: float | None,
     seed: int,
     output: Path,
     overwrite: bool,
@@ -82,7 +89,7 @@ def command(
     refuse_over(output, map_path, *(folder_of(spec) for spec in logs), *poses)
     refuse_existing(output, overwrite)
     labels = read_map(map_path)
-    truth = truth_map(labels)
+    truth = truth_map(labels, max_sigma or float("inf"))
     sources, masks = _read(logs, poses, truth)
     found = _splits(sources, masks, splits or SPLITS, share, seed)
     with whole_folder(output, overwrite) as folder:

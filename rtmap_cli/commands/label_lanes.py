@@ -34,7 +34,7 @@ from rtmap_cli import options
 @click.option(
     "--bound",
     type=options.FiniteRange(0, min_open=True),
-    default=1.6,
+    default=1.9,
     show_default=True,
     help="Metres by which --snap moves a border at most.",
 )

@@ -104,7 +104,8 @@ def transform(pose: Array, points: Array) -> Array:
     """Apply one (4, 4) transform to (..., 2) or (..., 3) points of the source frame.
 
     With (..., 2) points the planar part is used (z = 0, roll and pitch ignored); a NaN height
-    (unknown) stays NaN and does not spoil x and y.
+    (unknown) stays NaN and does not spoil x and y: such a point is taken on the plane z = 0 of the
+    frame to whose origin it is nearer, the vehicle's, however far away the map's origin lies.
     """
     points = np.asarray(points, dtype=np.float64)
     if points.shape[-1] == 2:
@@ -113,11 +114,14 @@ def transform(pose: Array, points: Array) -> Array:
         return points @ np.array([[c, s], [-s, c]]) + pose[:2, 3]
     unknown = np.isnan(points[..., 2])
     filled = points.copy()
-    # An unknown height is taken on the ground plane of the target for x and y only.
     filled[unknown, 2] = 0.0
     out = filled @ pose[:3, :3].T + pose[:3, 3]
     if unknown.any():
-        out[unknown, :2] = transform(pose, points[unknown, :2])
+        upright = pose[2, 2] if abs(pose[2, 2]) > 0.1 else 1.0
+        on_target = out[unknown] - np.multiply.outer(out[unknown, 2] / upright, pose[:3, 2])
+        far = np.hypot(*np.moveaxis(filled[unknown, :2], -1, 0))
+        nearer = np.hypot(*np.moveaxis(on_target[..., :2], -1, 0)) < far
+        out[unknown, :2] = np.where(nearer[..., None], on_target[..., :2], out[unknown, :2])
         out[unknown, 2] = np.nan
     return out
 

@@ -9,7 +9,7 @@ that see any ground of a test frame are left out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -141,18 +141,36 @@ def _split(name: str, train: Bools, test: Bools, kind: NDArray[np.int64], ground
     return Split(name, train, test, ground.shared(train, test), by_type)
 
 
-def truth_map(vector_map: VectorMap) -> VectorMap:
+def truth_map(vector_map: VectorMap, max_sigma: float = np.inf) -> VectorMap:
     """The lines of the labels that networks learn (``CLASSES``), each once: bounds that two lanes
-    have in common are drawn by both of them."""
+    have in common are drawn by both of them. Stretches whose sigma is above ``max_sigma`` metres
+    are left out; what has no sigma (drawn by hand) stays."""
     kept: list[Element] = [e for e in vector_map if e.class_name in RING_CLASSES]
     for name in (c for c in CLASSES if c not in RING_CLASSES):
-        lines = sorted(vector_map.of_class(name), key=lambda e: (-length(e.points), e.element_id))
+        known = [p for e in vector_map.of_class(name) for p in _certain(e, max_sigma)]
+        lines = sorted(known, key=lambda e: (-length(e.points), e.element_id))
         drawn: list[Any] = []
         for element in lines:
             parts = _not_drawn(element, drawn)
             drawn.append(shapely.linestrings(element.xy).buffer(TWICE))
             kept += parts
     return VectorMap(sorted(kept, key=lambda e: e.element_id), vector_map.crs)
+
+
+def _certain(element: Element, max_sigma: float) -> list[Element]:
+    """The stretches of a line whose vertices have at most ``max_sigma`` metres across and along."""
+    if element.covariance is None or not np.isfinite(max_sigma):
+        return [element]
+    loose = (element.covariance[:, 0] + element.covariance[:, 2]) / 2 > max_sigma**2
+    if not loose.any():
+        return [element]
+    ends = np.flatnonzero(np.diff(np.concatenate([[True], loose, [True]]).astype(np.int8)))
+    out = []
+    for k, (a, b) in enumerate(zip(ends[::2], ends[1::2], strict=True)):
+        if b - a > 1 and length(element.points[a:b]) >= LEAST:
+            part = element.with_points(element.points[a:b], element.covariance[a:b])
+            out.append(replace(part, element_id=f"{element.element_id}-s{k}"))
+    return out
 
 
 def _not_drawn(element: Element, drawn: Sequence[Any]) -> list[Element]:

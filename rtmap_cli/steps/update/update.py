@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,7 @@ def update(
         lines += all_
         left = vectorise(found.rest, name, usual, settings) if mine else all_
         stretches += compare(name, mine, left, found, usual, settings)
-    told = _judged(stretches, traversals, near, found.claims, settings)
+    told = _named_apart(_judged(stretches, traversals, near, found.claims, settings))
     kept = [s for s, _ in told]
     cells = judge_cells(list(near), lines, kept, heat, judge, settings)
     flagged = {id(s) for s in flagged_stretches(kept, cells)}
@@ -118,6 +119,17 @@ def _judged(
             enough = agreed >= min(settings.drives, len(traversals))
             if enough and event.probability >= min(CANDIDATE, settings.min_probability):
                 out.append((s, event))
+    return out
+
+
+def _named_apart(told: list[tuple[Stretch, ChangeEvent]]) -> list[tuple[Stretch, ChangeEvent]]:
+    """Changes whose middles lie within the same metre get names of their own."""
+    count: Counter[str] = Counter()
+    out = []
+    for stretch, event in told:
+        k = count[event.change_id]
+        count[event.change_id] += 1
+        out.append((stretch, replace(event, change_id=f"{event.change_id}-{k}") if k else event))
     return out
 
 

@@ -22,6 +22,10 @@ CALTRANS = 3.048
 COLUMNS = ("x", "y", "radius", "left", "right")
 EVERY = 2
 """Samples of the centre line per vertex of a border."""
+SAME = 0.3
+"""Metres by which places of one line differ at most."""
+MOVED = 0.1
+"""Metres by which a node may draw a border aside that still counts as seen there."""
 KINDS = ("width", "paint", "curb")
 """What a border's place was taken from."""
 
@@ -97,7 +101,7 @@ def borders_of(graph: LaneGraph, sides: list[Sides]) -> list[Borders]:
 def _at_nodes(graph: LaneGraph, sides: list[Sides]) -> dict[int, Array]:
     """(2, 2) left and right vertex at every node: square to the mean direction.
 
-    What was seen counts before what was assumed.
+    What was seen counts before what was assumed; where edges saw different lines, the nearest one.
     """
     found: dict[int, list[tuple[Array, NDArray[np.int8]]]] = defaultdict(list)
     place: dict[int, Array] = {}
@@ -110,9 +114,9 @@ def _at_nodes(graph: LaneGraph, sides: list[Sides]) -> dict[int, Array]:
         heading = graph.heading(node)
         left = np.array([-heading[1], heading[0]])
         metres, kind = (np.array(x) for x in zip(*parts, strict=True))
-        seen = (kind > 0).astype(float)
-        weight = np.where(seen.sum(axis=0) > 0, seen, 1.0)
-        mean = (metres * weight).sum(axis=0) / weight.sum(axis=0)
+        known = np.where((kind > 0).any(axis=0), kind > 0, True)
+        known &= metres <= np.where(known, metres, np.inf).min(axis=0) + SAME
+        mean = (metres * known).sum(axis=0) / known.sum(axis=0)
         out[node] = np.stack([place[node] + mean[0] * left, place[node] - mean[1] * left])
     return out
 
@@ -123,10 +127,12 @@ def _borders(e: Edge, s: Sides, shared: dict[int, Array]) -> Borders:
     for side, sign in enumerate((1.0, -1.0)):
         line = e.xy + sign * s.metres[:, side, None] * normal
         first, last = shared[e.start][side] - line[0], shared[e.end][side] - line[-1]
+        there = line
         line = drawn(line, first, last)
+        aside = np.abs(((line - there) * normal).sum(axis=1))
         keep = _thinned(_forwards(line, e.xy))
         lines.append(line[keep])
-        kinds.append(s.kind[keep, side])
+        kinds.append(np.where(aside > MOVED, 0, s.kind[:, side])[keep].astype(np.int8))
         lines[-1][0], lines[-1][-1] = shared[e.start][side], shared[e.end][side]
     return Borders((lines[0], lines[1]), (kinds[0], kinds[1]))
 

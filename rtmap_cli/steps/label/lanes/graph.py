@@ -75,12 +75,12 @@ class LaneGraph:
         return out
 
 
-def lane_graph(traces: list[Trace], longest: float = 100.0) -> LaneGraph:
-    """Lanes of traces as a graph; edges longer than ``longest`` metres are cut."""
+def lane_graph(traces: list[Trace]) -> LaneGraph:
+    """Lanes of traces as a graph: edges from fork to merge, rings in three pieces."""
     out = strands_of(traces)
     edges = joined(without_spurs(_Cutter(out, _averaged(out)).edges()))
     edges = joined(without_changes(edges))
-    return LaneGraph(_meeting(_cut(edges, longest)))
+    return LaneGraph(_meeting(_sampled(edges)))
 
 
 @dataclass
@@ -310,15 +310,13 @@ def _onward(
     return out
 
 
-def _cut(edges: list[Edge], longest: float) -> list[Edge]:
-    """No edge longer than ``longest``; rings in three pieces at least."""
+def _sampled(edges: list[Edge]) -> list[Edge]:
+    """Edges with a vertex every STEP; rings in three pieces, since no lanelet follows itself."""
     free = 1 + max((max(e.start, e.end) for e in edges), default=0)
     out = []
     for e in edges:
-        pieces = int(np.ceil(length(e.xy) / longest))
-        if e.start == e.end:
-            pieces = max(pieces, 3)
         line = resample_step(e.xy, STEP)
+        pieces = 3 if e.start == e.end else 1
         marks = np.linspace(0, len(line) - 1, pieces + 1).round().astype(int)
         nodes = [e.start, *range(free, free + pieces - 1), e.end]
         free += pieces - 1

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, gaussian_filter, gaussian_filter1d, uniform_filter1d
+from scipy.ndimage import gaussian_filter, gaussian_filter1d, uniform_filter1d
 from scipy.spatial import cKDTree
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.polylines import normals, resample_step
 from rtmap_cli.geometry.poses import transform
 from rtmap_cli.maps.crs import check_same_crs
-from rtmap_cli.steps.label.lanes.borders import Sides
+from rtmap_cli.steps.label.lanes.borders import SAME, Sides
 from rtmap_cli.steps.label.lanes.curbs import paint_and_curbs
 from rtmap_cli.steps.label.lanes.graph import LaneGraph
 from rtmap_cli.steps.label.lanes.traces import STEP
@@ -33,17 +33,23 @@ BLUR = (1.0, 0.06)
 """Metres along and across by which what was seen is blurred."""
 TURNING = 8.0
 """Cost of a metre aside: as much as four metres of line that was clearly seen."""
+JUMP = 4.0
+"""Cost of going on along another line: as much as two metres that were clearly seen."""
+EASED = 2.0
+"""Metres on both sides of such a jump over which the border goes across."""
 STEEPEST = 3
 """Bins by which a border may go aside from sample to sample."""
-FARTHER = 0.15
-"""Share of its weight that a line loses per metre: the nearest line is the lane's own."""
+FARTHER = 0.2
+"""Share of its weight that a line loses per metre where lines are chosen from: the nearest one is
+the lane's own. Whether it was seen does not depend on it."""
 SEEN = 0.4
 """Score from which a place was seen."""
 BESIDE = 1.5
 """Metres across over which a line stands out."""
 REACH = 3.0
 """Metres along by which what was seen holds on both sides: half a gap between dashes."""
-WIDE = 2 * int(REACH / STEP) + 1
+DOUBLE = 8
+"""Bins to each side of a line of paint in which its second stripe is looked for."""
 OBSERVED = {"divider": 1, "boundary": 2}
 """KINDS code by class of an observation."""
 
@@ -152,35 +158,55 @@ def _draw(sides: Sides, side: int, profile: Array, bound: float) -> None:
     metres: Array = (np.arange(profile.shape[2], dtype=np.float64) + 0.5) * BIN
     allowed = np.abs(metres - sides.metres[:, side, None]) <= bound
     allowed &= metres >= NEAREST
-    score = profile.max(axis=0) * np.clip(1 - FARTHER * (metres - NEAREST), 0, 1)
-    score = np.where(allowed, score, 0.0)
-    path = _best_path(score)
+    score = np.where(allowed, profile.max(axis=0), 0.0)
+    path = _best_path(score * np.clip(1 - FARTHER * (metres - NEAREST), 0, 1))
     rows = np.arange(len(path))
-    there = score[rows, path]
-    # A line is long: what is short is a stripe, a vehicle, noise.
-    there = np.where(uniform_filter1d(there, int(2 * REACH / STEP)) > SEEN / 2, there, 0.0)
-    seen = binary_closing(np.pad(there > SEEN, WIDE), np.ones(WIDE, bool))[WIDE:-WIDE]
-    fine = gaussian_filter1d(_peak(score, path, metres), 2.0, mode="nearest")
+    fine = _peak(profile, path, metres)
+    seen = _seen(score[rows, path], fine)
+    jumps = np.concatenate([[False], np.abs(np.diff(path)) > STEEPEST])
+    seen &= ~(uniform_filter1d(jumps.astype(float), int(2 * EASED / STEP)) > 1e-9)
     if not seen.any():
         return
-    value = np.interp(rows, rows[seen], fine[seen])
+    value = np.interp(rows, rows[seen], gaussian_filter1d(fine, 2.0, mode="nearest")[seen])
     free = sides.kind[:, side] == 0
     sides.metres[free, side] = value[free]
     best = profile[:, rows, path].argmax(axis=0) + 1
     sides.kind[free & seen, side] = best[free & seen]
 
 
-def _peak(score: Array, path: NDArray[np.int64], metres: Array) -> Array:
-    """Metres of the path, between bins where the score says so (mean of three bins)."""
-    rows, last = np.arange(len(path)), score.shape[1] - 1
-    around = np.clip(path[:, None] + np.arange(-2, 3), 0, last)
-    weight = score[rows[:, None], around] + 1e-6
-    out: Array = (weight * metres[around]).sum(axis=1) / weight.sum(axis=1)
+def _seen(score: Array, metres: Array) -> NDArray[np.bool_]:
+    """(n,) where a path of ``score`` and ``metres`` aside (n,) was seen, gaps bridged."""
+    # A line is long: what is short is a stripe, a vehicle, noise.
+    long = uniform_filter1d(score, int(2 * REACH / STEP)) > SEEN / 2
+    seen = long & (score > SEEN)
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(np.int8)))
+    for a, b in zip(ends[1:-1:2], ends[2:-1:2], strict=True):
+        near = min(a, len(score) - b, 4)
+        aside = np.median(metres[a - near : a]) - np.median(metres[b : b + near])
+        if b - a <= 2 * REACH / STEP and abs(aside) < SAME:
+            seen[a:b] = True
+    return seen
+
+
+def _peak(profile: Array, path: NDArray[np.int64], metres: Array) -> Array:
+    """Metres of the path, between bins where the score (kinds, n, bins) says so: the middle of a
+    curb, and of both stripes where paint is a double line."""
+    rows, last = np.arange(len(path)), profile.shape[2] - 1
+    kind = profile[:, rows, path].argmax(axis=0)
+    reach = np.where(kind == 0, DOUBLE, 2)[:, None]
+    around = path[:, None] + np.arange(-DOUBLE, DOUBLE + 1)
+    weight = profile[kind[:, None], rows[:, None], np.clip(around, 0, last)]
+    ours = (np.abs(around - path[:, None]) <= reach) & (around >= 0) & (around <= last)
+    weight = np.where(ours, weight, 0.0)
+    faint = (np.abs(around - path[:, None]) > 2) & (weight < 0.5 * weight.max(axis=1)[:, None])
+    weight = np.where(faint, 0.0, weight) + 1e-6 * (around == path[:, None])
+    out: Array = (weight * metres[np.clip(around, 0, last)]).sum(axis=1) / weight.sum(axis=1)
     return out
 
 
 def _best_path(score: Array) -> NDArray[np.int64]:
-    """(n,) bins of the path that collects most, going aside costs TURNING per metre."""
+    """(n,) bins of the path that collects most; going aside costs TURNING per metre, another line
+    JUMP."""
     n, bins = score.shape
     total, back = score[0].copy(), np.zeros((n, bins), np.int64)
     steps = np.arange(-STEEPEST, STEEPEST + 1)
@@ -188,11 +214,15 @@ def _best_path(score: Array) -> NDArray[np.int64]:
     cost = TURNING * BIN * np.abs(steps)
     outside = (from_bin < 0) | (from_bin >= bins)
     index = np.clip(from_bin, 0, bins - 1)
+    rows = np.arange(bins)
     for k in range(1, n):
         options = np.where(outside, -np.inf, total[index] - cost)
         best = options.argmax(axis=1)
-        back[k] = index[np.arange(bins), best]
-        total = options[np.arange(bins), best] + score[k]
+        back[k], near = index[rows, best], options[rows, best]
+        far = int(total.argmax())
+        jumps = near < total[far] - JUMP
+        back[k, jumps] = far
+        total = np.where(jumps, total[far] - JUMP, near) + score[k]
     path = np.zeros(n, np.int64)
     path[-1] = int(total.argmax())
     for k in range(n - 1, 0, -1):

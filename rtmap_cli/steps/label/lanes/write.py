@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from rtmap_cli.formats.lanelet2.read import Lanelet2Map, read_lanelet2
 from rtmap_cli.formats.lanelet2.tags import ID_TAG
 from rtmap_cli.geometry.polylines import length
 from rtmap_cli.maps.crs import to_lonlat
+from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.label.lanes.borders import KINDS, Borders
 from rtmap_cli.steps.label.lanes.graph import Edge, LaneGraph
 
@@ -29,6 +31,9 @@ TURN = 60.0
 STEP_KMH = 10.0
 SHARE = 0.5
 """Share of the vertices that must have been seen as paint or curb for the way to be one."""
+SIGMA = (1.5, 0.06, 0.06)
+"""Metres across by KINDS: what benchmarks/label_lanes.py finds of what was assumed, and of what was
+seen (90 % lie within 0.1 m)."""
 
 
 def names_of(graph: LaneGraph) -> list[str]:
@@ -51,20 +56,41 @@ def speed_of(edge: Edge, limit: float | None) -> float:
 
 
 def to_lanelet2(
-    graph: LaneGraph, borders: list[Borders], crs: str, limit: float | None
+    graph: LaneGraph, borders: list[Borders], crs: str, limit: float | None, looked: bool = False
 ) -> Lanelet2Map:
-    """The lanelets, as ``rtmap import lanelet2`` would read them."""
-    out, points = _osm(graph, borders, limit)
+    """The lanelets, as ``rtmap import lanelet2`` would read them; borders have the covariance of
+    what their places were taken from. Where lines were ``looked`` for, a border that was not seen
+    is virtual."""
+    out, points = _osm(graph, borders, limit, looked)
     out.nodes = placed_nodes(points, {}, Frame(crs), local=False)
     out.attributes = {"version": "0.6", "generator": "rtmap"}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "lanes.osm"
         write_osm(out, path)
-        return read_lanelet2(path, crs=crs, join=False)
+        made = read_lanelet2(path, crs=crs, join=False)
+    return replace(made, vector_map=_with_sigmas(made.vector_map, graph, borders))
+
+
+def _with_sigmas(vector_map: VectorMap, graph: LaneGraph, borders: list[Borders]) -> VectorMap:
+    """The map with SIGMA of every vertex of a border, along lines too: it slides."""
+    numbers, kinds = Numbers(set()), {}
+    for b, name in zip(borders, names_of(graph), strict=True):
+        for side, k in zip(("left", "right"), b.kinds, strict=True):
+            kinds[f"way-{numbers.of(f'{name}/{side}')}"] = k
+    out = []
+    for element in vector_map:
+        kind = kinds.get(element.element_id)
+        if kind is not None and len(kind) == len(element.points):
+            variance = np.take(SIGMA, kind) ** 2
+            nothing = np.full(len(kind), np.nan)
+            covariance = np.stack([variance, 0 * variance, variance, nothing], axis=-1)
+            element = element.with_points(element.points, covariance)
+        out.append(element)
+    return VectorMap(out, vector_map.crs, vector_map.version)
 
 
 def _osm(
-    graph: LaneGraph, borders: list[Borders], limit: float | None
+    graph: LaneGraph, borders: list[Borders], limit: float | None, looked: bool
 ) -> tuple[OsmFile, dict[int, Array]]:
     out, points = OsmFile(), {}
     numbers = Numbers(set())
@@ -90,7 +116,7 @@ def _osm(
                 node(p, f"{name}/{side}/{k}", k in (0, last)) for k, p in enumerate(line)
             ]  # fmt: skip
             way = numbers.of(f"{name}/{side}")
-            out.ways[way] = Way(nodes, _way_tags(kinds, turn))
+            out.ways[way] = Way(nodes, _way_tags(kinds, looked or turn))
             members.append(Member("way", way, side))
         tags = {
             "type": "lanelet", "subtype": "road", "location": "urban", "one_way": "yes",
@@ -101,11 +127,12 @@ def _osm(
     return out, points
 
 
-def _way_tags(kinds: NDArray[np.int8], turn: bool) -> Tags:
+def _way_tags(kinds: NDArray[np.int8], open_: bool) -> Tags:
+    """Tags of a border; one that was mostly not seen is virtual where that is ``open_``."""
     share = np.bincount(kinds, minlength=len(KINDS)) / len(kinds)
-    best = int(share[1:].argmax()) + 1
     if share[1:].sum() < SHARE:
-        return {"type": "virtual" if turn else "road_border", SOURCE_TAG: KINDS[0]}
+        return {"type": "virtual" if open_ else "road_border", SOURCE_TAG: KINDS[0]}
+    best = int(share[1:].argmax()) + 1
     tags = {"type": "line_thin"} if KINDS[best] == "paint" else {"type": "road_border"}
     return tags | {SOURCE_TAG: KINDS[best]}
 
