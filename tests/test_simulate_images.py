@@ -71,6 +71,16 @@ def test_another_drive_sees_the_same_world(rtmap, town, tmp_path):
     assert not np.allclose(a.pose, b.pose)
 
 
+def test_a_tour_comes_back(rtmap, town, tmp_path):
+    log = tmp_path / "log"
+    rtmap("simulate", "images", "--map", town, "--log", "town:", "--route", "tour", "--length", 800,
+          "--spacing", 20, "--width", 32, "--rig", "campus", "-q", "-o", log)  # fmt: skip
+    xy = NativeLog(log).truth_poses().pose[:, :2, 3]
+    apart = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
+    later = np.arange(len(xy))[:, None] - np.arange(len(xy)) > 4
+    assert len(xy) == 41 and apart[later].min() < 12
+
+
 def test_lanes_survive_changes_of_the_map(rtmap, town, tmp_path):
     world = tmp_path / "world"
     rtmap("simulate", "changes", "--map", town, "--change", "delete:ped_crossing", "-o", world)

@@ -44,10 +44,10 @@ POSITIVE = options.FiniteRange(0, min_open=True)
 )
 @click.option(
     "--route",
-    type=click.Choice(["straight", "turning"]),
+    type=click.Choice(["straight", "turning", "tour"]),
     default="turning",
     show_default=True,
-    help="Kind of a drive through a town.",
+    help="Kind of a drive through a town; a tour comes back to places that it knows.",
 )
 @options.town_length(160.0)
 @click.option("--spacing", type=POSITIVE, help="Metres between frames [default: 2.5 in a town].")

@@ -36,7 +36,8 @@ class Domain:
     ``style`` of its streets (`TownStyle`), its widths ``sizes`` (m); ``rig`` of cameras with images
     of ``width`` pixels, ``lidar`` a key of `LIDARS`; a frame every ``spacing`` metres over
     ``length`` metres; a share ``errors`` of the masks is wrong; ``hills`` or a plain. ``taken_for``
-    are classes that its segmenter does not know, and what it says in their place.
+    are classes that its segmenter does not know, and what it says in their place; ``measured``
+    whether somebody measured what it confuses there.
     """
 
     style: str
@@ -49,6 +50,7 @@ class Domain:
     errors: float
     hills: bool
     taken_for: Mapping[str, str] = field(default_factory=dict)
+    measured: bool = True
 
     def cameras(self) -> Rig:
         """The rig with images of the domain's width."""
@@ -67,9 +69,15 @@ class Domain:
         return out
 
     def confusion(self) -> Array:
-        """(K, K) what a ground of class k (row) is taken for by this segmenter: the confusion of a
-        good one (`CONFUSION`) with its own words for classes, and a share ``errors`` of what is
-        thin taken for road. Raster cells then say honestly what cannot be told apart."""
+        """(K, K) what a ground of class k (row) is thought to be taken for by this segmenter.
+
+        Measured: the confusion of a good one (`CONFUSION`) with its own words for classes, and a
+        share ``errors`` of what is thin taken for road; raster cells then say honestly what cannot
+        be told apart. Else `CONFUSION`, as `rtmap semantic-map` without ``--confusion``: cells
+        believe what the segmenter says.
+        """
+        if not self.measured:
+            return CONFUSION
         rename = np.zeros_like(CONFUSION)
         for k, name in enumerate(CLASSES):
             rename[k, CLASSES.index(self.taken_for.get(name, name))] = 1.0
@@ -89,9 +97,10 @@ DOMAINS = {
     "city": Domain("city", (220.0, 340.0), default_rig, 384, "hdl32", 3.0, 120.0, 0.02, False),
     "campus": Domain(
         "campus", (220.0, 340.0), campus_rig, 384, "vlp16", 4.0, 140.0, 0.15, True,
-        {"curb": "terrain", "sidewalk": "terrain", "crosswalk": "marking"},
+        {"curb": "sidewalk", "terrain": "sidewalk", "crosswalk": "marking"}, measured=False,
     ),
 }  # fmt: skip
 """``city``: wide streets in a plain, seven cameras all round, 32 rings, good masks. ``campus``:
 narrow streets on hills, a cart with two front cameras and a VLP-16 that keeps two frames a second,
-and a segmenter that tells road, paint and what is beside the road, no more. Both are invented."""
+and a segmenter that tells road, paint and what is beside the road (sidewalk, it says), no more;
+what it confuses nobody has measured. Both are invented."""
