@@ -27,19 +27,22 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from rtmap_models.architecture import build_network
 from rtmap_models.config import SemanticConfig
 from rtmap_models.data.samples import clip
+from rtmap_models.data.shards import Frames
 from rtmap_models.data.views import scene_at
 from rtmap_models.semantic.domains import DOMAINS, LABEL_CLASSES, Domain
 from rtmap_models.semantic.drives import town_rasters
-from rtmap_models.training.checkpoint import config_to_train
-from rtmap_models.training.validate import detections_of, named
+from rtmap_models.semantic.frames import generate_drives
+from rtmap_models.training.checkpoint import config_to_train, start_from
+from rtmap_models.training.validate import detections_of, named, validate
 
 from rtmap_cli.cli import run as rtmap
 from rtmap_cli.errors import NoAnswer
 from rtmap_cli.logs.semantic import CLASSES as RASTER_CLASSES
 from rtmap_cli.maps.crop import MapIndex
-from rtmap_cli.output import plain, table
+from rtmap_cli.output import log, plain, table
 from rtmap_cli.steps.evaluate.drives import read_drives
 from rtmap_cli.steps.evaluate.maps.compare import Settings, compare_frames, label_frames, read_side
 from rtmap_cli.steps.evaluate.maps.precision import MapScore, Scorer
@@ -65,6 +68,8 @@ PAPER_SCENARIOS = {  # Tab. 3: mAP after and before
 FIRST_TOWN = 9100
 FIRST_TOUR = 9200
 FACTOR_TOWN = 9300
+PRIOR_SEED = 9
+"""Of the frames that are read with a prior: towns from 900,000 on."""
 
 
 @dataclass(frozen=True)
@@ -225,6 +230,23 @@ def on_domain(model: MapModel, config: SemanticConfig, domain: Domain, towns: in
     return scorer.result()
 
 
+def with_prior(models: Iterable[str], data: Path, frames: int) -> list[list[str]]:
+    """Rows of what models make of a wrong prior (`validate`), on rasters of other campus towns."""
+    rows = []
+    for model in models:
+        config = config_to_train(None, model)
+        assert isinstance(config, SemanticConfig)
+        generate_drives(config, "campus", data / "prior-frames", frames, PRIOR_SEED, 1, log)
+        network = build_network(config)
+        start_from(network, model)
+        found = validate(network, Frames(data / "prior-frames", config), frames)
+        rows.append([Path(model).stem, str(frames), *(f"{found[k]:.3f}" for k in PRIOR_HEAD)])
+    return rows
+
+
+PRIOR_HEAD = ("mAP", "mAP prior", "mAP unchanged prior", "AUC existence")
+
+
 def row(name: str, score: MapScore, paper: tuple[float, ...] | None = None) -> list[str]:
     """A row of Tab. 2: AP by class and mAP in per cent."""
     values = [*(score.classes[c].mean for c in CLASSES), score.mAP]
@@ -278,6 +300,7 @@ def main() -> None:
     parser.add_argument("--tours", type=int, default=2, help="test logs that come back")
     parser.add_argument("--tour-length", type=float, default=600.0, help="of such a drive, m")
     parser.add_argument("--factors", type=int, default=0, metavar="TOWNS", help="also the factors")
+    parser.add_argument("--prior-frames", type=int, default=0, help="also read with a prior")
     parser.add_argument("--markdown", action="store_true")
     parser.add_argument("--json", type=Path, help="write the figures")
     a = parser.parse_args()
@@ -298,6 +321,10 @@ def main() -> None:
     figures: dict[str, Any] = {name: s.as_json() for name, s in scores.items()}
     figures |= {f"{n}, before": s.as_json() for n, s in by_before.items()}
     figures |= {f"{n}, after": s.as_json() for n, s in by_after.items()}
+    if a.prior_frames:
+        rows = with_prior((a.source, tuned), a.data, a.prior_frames)
+        show(("model", "frames", *PRIOR_HEAD), rows, a.markdown)
+        figures["prior"] = rows
     if a.factors:
         config = config_to_train(None, a.source)
         assert isinstance(config, SemanticConfig)
