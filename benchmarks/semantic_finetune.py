@@ -313,9 +313,13 @@ def main() -> None:
     scores = {"city → campus": before, "city + campus → campus": after}
     if a.city_logs:
         own = make_logs(a.data, "city", a.city_logs, a.length)
-        scores = {"city → city": judge(own, a.source, a.data / "runs-city")[0], **scores}
+        scores = {
+            "city → city": judge(own, a.source, a.data / "runs-city")[0],
+            "city + campus → city": judge(own, tuned, a.data / "runs-city-after")[0],
+            **scores,
+        }
     print(f"simulated, range 60 × 30 m, Chamfer 0.5 / 1.0 / 1.5 m; {len(logs)} campus towns\n")
-    show(HEAD, [row(name, s, PAPER[name]) for name, s in scores.items()], a.markdown)
+    show(HEAD, [row(name, s, PAPER.get(name)) for name, s in scores.items()], a.markdown)
     head = ("scenario (* unadapted)", *HEAD[1:-1], "paper")
     show(head, scenario_rows(by_before, by_after), a.markdown)
     figures: dict[str, Any] = {name: s.as_json() for name, s in scores.items()}

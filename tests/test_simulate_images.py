@@ -78,7 +78,7 @@ def test_a_tour_comes_back(rtmap, town, tmp_path):
     xy = NativeLog(log).truth_poses().pose[:, :2, 3]
     apart = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
     later = np.arange(len(xy))[:, None] - np.arange(len(xy)) > 4
-    assert len(xy) == 41 and apart[later].min() < 12
+    assert len(xy) >= 40 and apart[later].min() < 12
 
 
 def test_lanes_survive_changes_of_the_map(rtmap, town, tmp_path):
