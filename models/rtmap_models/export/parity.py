@@ -206,8 +206,9 @@ def compare(
 ) -> tuple[dict[str, float], float]:
     """Largest difference per output and the share of new queries that were replaced.
 
-    Only new queries of at least the score ``sure`` count. With ``sure`` 0 nothing counts as
-    replaced: every query must have its partner.
+    Points and sigmas are compared in units of their query's largest sigma where that is more than
+    a metre. Only new queries of at least the score ``sure`` count. With ``sure`` 0 nothing counts
+    as replaced: every query must have its partner.
     """
     worst = dict.fromkeys(OUTPUTS, 0.0)
     for name in ("prior_score", "pose_delta", "pose_covariance"):
@@ -224,8 +225,11 @@ def compare(
             other = keep & (gap > ELSEWHERE_M) & (rows < first)
             count, replaced = count + int(keep[:first].sum()), replaced + int(other.sum())
             keep &= ~other
+        # What nobody knows to a metre need not agree to a millimetre.
+        vague = np.maximum(1.0, a["sigma"].reshape(len(rows), -1).max(axis=1))
         for name in a:
-            difference = _difference(a[name][rows[keep]], z[name][partner[keep]])
+            unit = np.ones(len(rows)) if name == "scores" else vague
+            difference = _difference(a[name][rows[keep]], z[name][partner[keep]], unit[rows[keep]])
             worst[name] = float(np.maximum(worst[name], difference))
     return worst, replaced / max(1, count)
 
@@ -245,11 +249,15 @@ def _pairs(a: dict[str, Array], z: dict[str, Array], first: int) -> tuple[Array,
     return rows, partner
 
 
-def _difference(a: Array, b: Array) -> float:
-    """Largest difference, absolute up to 1 and relative above it (a variance may be large)."""
+def _difference(a: Array, b: Array, unit: Array | None = None) -> float:
+    """Largest difference, absolute up to 1 and relative above it (a variance may be large), or in
+    the ``unit`` (n,) of its row where that is larger."""
     if a.size == 0:
         return 0.0
-    return float((np.abs(a - b) / np.maximum(1.0, np.abs(a))).max())
+    size = np.maximum(1.0, np.abs(a))
+    if unit is not None:
+        size = np.maximum(size, unit.reshape(-1, *[1] * (a.ndim - 1)))
+    return float((np.abs(a - b) / size).max())
 
 
 def _by(size: tuple[int, int, int]) -> str:
