@@ -249,7 +249,7 @@ def test_changes_in_the_same_metre_have_names_of_their_own() -> None:
         for name, shift in (("divider", 0.0), ("divider", 0.1), ("boundary", 0.0))
     ]
     counts = Counts(traversals_seen=2, traversals_in_view=2)
-    told = _named_apart([(s, _event(s, counts, 3.0, 9.0)) for s in stretches])
+    told = _named_apart([(s, _event(s, counts, 3.0)) for s in stretches])
     names = [e.change_id for _, e in told]
     assert len(set(names)) == 3 and names[1] == f"{names[0]}-1"
     assert [s for s, _ in told] == stretches

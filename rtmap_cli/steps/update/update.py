@@ -112,13 +112,13 @@ def _judged(
         witness = Witnesses(traversals, old.of_class(name), name, claims.get(name), settings)
         for s in mine:
             counts, votes = witness.say(s)
-            event = _event(s, counts, votes, move_odds(s, stretches))
+            event = _event(s, counts, votes)
             agreed = counts.traversals_seen
             if event.kind == "delete":
                 agreed = counts.traversals_in_view - agreed
             enough = agreed >= min(settings.drives, len(traversals))
             if enough and event.probability >= min(CANDIDATE, settings.min_probability):
-                out.append((s, event))
+                out.append((s, _bounded(event, move_odds(s, stretches))))
     return out
 
 
@@ -133,10 +133,16 @@ def _named_apart(told: list[tuple[Stretch, ChangeEvent]]) -> list[tuple[Stretch,
     return out
 
 
-def _event(stretch: Stretch, counts: Counts, votes: float, most: float) -> ChangeEvent:
-    """A stretch as a change, with what its drives say; ``most``: its log-odds are no higher."""
+def _bounded(event: ChangeEvent, most: float) -> ChangeEvent:
+    """A change whose log-odds are at most ``most``: its place is looked at all the same."""
+    odds = min(event.log_odds, most)
+    return replace(event, probability=float(probability(odds)), log_odds=odds)
+
+
+def _event(stretch: Stretch, counts: Counts, votes: float) -> ChangeEvent:
+    """A stretch as a change, with what its drives say."""
     kind = KINDS[stretch.reason]
-    odds = min(BEFORE[kind] + (-votes if kind == "delete" else votes), most)
+    odds = BEFORE[kind] + (-votes if kind == "delete" else votes)
     points = stretch.points
     if stretch.class_name in RING_CLASSES and not is_ring(points):
         points = np.concatenate([points, points[:1]])
