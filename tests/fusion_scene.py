@@ -85,8 +85,9 @@ def drive(
     """One drive along the street: each visible element is found in ``found`` of the frames.
 
     ``boxes`` (k, 5) map-frame boxes relative to ORIGIN hide what stands behind them. With a
-    ``prior`` the detections come as answers to prior queries (matched or outdated).
+    ``prior`` what is in it comes as an answer to a prior query (matched or outdated) instead.
     """
+    asked = set() if prior is None else {e.element_id for e in prior}
     rng = np.random.default_rng(seed)
     x = np.arange(span[0], span[1], 2.5)
     pose = se3_from_xyyaw(ORIGIN[0] + x, np.full(len(x), ORIGIN[1] + y), np.zeros(len(x)))
@@ -103,6 +104,8 @@ def drive(
         for e in seen:
             middle = resample(e.points[:, :2], V)
             if hidden(middle, local_boxes).mean() > 0.3 or rng.random() > found:
+                continue
+            if e.source.element_id in asked:
                 continue
             points = middle + rng.normal(0, noise, (V, 2)) * 0.7 + drift
             if e.class_name == "ped_crossing":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from fusion_scene import CRS, ORIGIN, drive, line, save, street
 
 from rtmap_cli.formats.changes import ChangeEvent
+from rtmap_cli.logs.run import MATCHED, Run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.evidence import Counts, DriveEvidence, Policy, prior_log_odds
 from rtmap_cli.maps.policy import read_policy
@@ -76,6 +78,48 @@ def test_what_misses_says_so_drive_by_drive(rtmap: Call, tmp_path: Path) -> None
     for e in found["properties"]["evidence"]:
         assert e["frames_in_view"] > 5 and e["frames_seen"] == 0 and e["score"] is None
         assert e["log_odds"] < 0 and not e["found"]
+
+
+def _deceived(run: Run, name: str, every: int) -> Run:
+    """The run with the answer "it is there" about an element in every so many frames."""
+    o = run.observations
+    fooled = (o.element_id == name) & (o.frame % every == 0)
+    return replace(
+        run,
+        observations=replace(
+            o,
+            state=np.where(fooled, MATCHED, o.state).astype(np.int8),
+            score=np.where(fooled, 0.9, o.score).astype(np.float32),
+            existence=np.where(fooled, 0.9, o.existence).astype(np.float32),
+        ),
+    )
+
+
+def test_a_network_that_the_map_deceives_now_and_then_is_not_believed(
+    rtmap: Call, tmp_path: Path
+) -> None:
+    # It finds what it is asked about nearly always; once in five frames is no sign of worn paint.
+    prior, world = street(), street(without=["west", "lane"])
+    runs = [drive(world, f"d{k}", seed=k, prior=prior) for k in range(2)]
+    runs = [_deceived(_deceived(r, "lane", 5), "west", 5) for r in runs]
+    found = _told(rtmap, tmp_path, prior, runs)
+    assert {(c["properties"]["kind"], c["properties"]["element_id"]) for c in found} == {
+        ("delete", "west"), ("delete", "lane"),
+    }  # fmt: skip
+    for c in found:
+        # "It is gone" is no find, "it is there" is.
+        share = c["properties"]["frames_seen"] / c["properties"]["frames_in_view"]
+        assert 0.1 < share < 0.4 and c["properties"]["probability"] > 0.8
+
+
+def test_what_a_network_sees_that_was_not_asked_is_found_less_often(
+    rtmap: Call, tmp_path: Path
+) -> None:
+    # What it is asked about it finds in all frames, what is new in half of them.
+    prior = street(without=["west"])
+    runs = [drive(street(), f"d{k}", seed=k, prior=prior, found=0.45) for k in range(2)]
+    (found,) = _told(rtmap, tmp_path, prior, runs)
+    assert (found["properties"]["kind"], found["properties"]["class"]) == ("insert", "ped_crossing")
 
 
 def test_a_drive_that_never_looks_leaves_existence_as_it_is(rtmap: Call, tmp_path: Path) -> None:

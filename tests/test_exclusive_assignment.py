@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -36,6 +38,18 @@ def test_of_two_detections_of_a_frame_the_nearer_keeps_the_line() -> None:
     # In two frames both may be the same line, seen a little off.
     _, taken = assign_once(stations, _samples(_line(0.2), _line(1.1), frames=[0, 1]))
     assert taken.all()
+
+
+def test_a_doubtful_detection_does_not_drive_out_a_sure_one() -> None:
+    stations = stations_of([_line(0.0)])
+    samples = _samples(_line(0.0), _line(0.4))
+    sure = np.where(samples.detection == 1, 0.95, 0.2)
+    _, taken = assign_once(stations, replace(samples, score=sure))
+    assert taken.tolist() == [False] * 39 + [True] * 39
+    # Where it lies far beside the line it does.
+    samples = _samples(_line(0.0), _line(1.45))
+    _, taken = assign_once(stations, replace(samples, score=sure))
+    assert taken.tolist() == [True] * 39 + [False] * 39
 
 
 def test_the_one_that_loses_goes_to_the_next_line() -> None:

@@ -11,7 +11,7 @@ import shapely
 from rtmap_cli.errors import NoAnswer, UsageError
 from rtmap_cli.geometry.polylines import length
 from rtmap_cli.maps.crs import lonlat_to
-from rtmap_cli.maps.element import VectorMap
+from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import read_map
 from rtmap_cli.steps.simulate.towns.town import Town, make_town
 from rtmap_cli.steps.simulate.worlds.changes import ChangeSpec, change_world, parse_spec
@@ -59,6 +59,24 @@ def test_insert_lies_on_the_road_apart_from_the_rest(town, name):
         old = [shapely.linestrings(e.xy) for e in town.vector_map]
         assert shapely.distance(shapely.linestrings(change.points), old).min() >= 1.1
         assert 10 < length(change.points) < 22
+
+
+def test_a_crossing_goes_in_beside_one_that_crosses_itself(town):
+    (x, y), (u, v) = (
+        f(np.concatenate([e.xy for e in town.vector_map]), 0) for f in (np.min, np.max)
+    )
+    # Two of them that overlap: their outlines meet at points that belong to neither.
+    loops = [
+        np.array([(x, y), (u, v + k), (u, y + k), (x, v), (x, y)]) * 0.01
+        + 0.99 * np.array([x - 50, y - 50])
+        for k in (0.0, 3.0)
+    ]
+    broken = [Element(f"loop-{k}", "ped_crossing", loop) for k, loop in enumerate(loops)]
+    before = VectorMap([*town.vector_map, *broken], town.vector_map.crs)
+    _, (change,) = change_world(
+        before, [ChangeSpec("insert", "ped_crossing")], np.random.default_rng(2)
+    )
+    assert change.kind == "insert"
 
 
 def test_move_is_a_delete_and_an_insert_beside(town):

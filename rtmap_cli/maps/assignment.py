@@ -61,9 +61,9 @@ def assign_once(
     """Assign stretches of detections to strands, and say which samples found one.
 
     A detection goes to the strand of largest gain Σ spacing · (1 − (offset / gate)²); of those of
-    one frame at one place of a strand the one of largest mean gain stays. What is left goes to the
-    next one, for ``rounds`` rounds. With ``first`` (stations,) the lines of these stations
-    choose before all others. The gate is ``GATE``; ``wide``: ``WIDE`` sigmas of the usual
+    one frame at one place of a strand the one of largest mean gain times score stays. What is left
+    goes to the next one, for ``rounds`` rounds. With ``first`` (stations,) the lines of these
+    stations choose before all others. The gate is ``GATE``; ``wide``: ``WIDE`` sigmas of the usual
     detection where that is more.
     """
     taken = np.zeros(len(samples), bool)
@@ -110,6 +110,8 @@ class _Feet:
         self.free = np.ones(len(self.sample), bool)
         total = np.bincount(samples.detection, samples.spacing)
         self.least = np.minimum(MIN_STRETCH, 0.6 * total)
+        self.score = np.zeros(len(total))
+        self.score[samples.detection] = samples.score
 
     def pick(self, index: Int) -> Feet:
         """Some of the feet."""
@@ -133,7 +135,8 @@ class _Feet:
         best = np.zeros(len(pairs), bool)
         best[order] = np.concatenate([[True], owner[order][1:] != owner[order][:-1]])
         wanted = (best & enough)[inverse]
-        mean = gain / np.maximum(cover, 1e-9)
+        # A doubtful detection, however near, does not drive out a sure one.
+        mean = gain / np.maximum(cover, 1e-9) * self.score[owner]
         index, inverse = index[wanted], inverse[wanted]
         if not len(index):
             return index

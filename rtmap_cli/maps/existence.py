@@ -13,11 +13,14 @@ Two models are compared:
   place for that drive only.
 
 So one silent drive says less than two, and a ghost loses against the drives that do not see it.
+
+A network that is given the map (a *prompted* place) finds what is there nearly always, and is
+easier to deceive where nothing is: such votes have rates of their own.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +35,17 @@ PRIOR_LOG_ODDS = 2.5
 
 
 @dataclass(frozen=True)
+class Prompted:
+    """What of a ``VoteModel`` differs where the network was asked about an element of the map."""
+
+    found: float = 0.9
+    strength: float = 8.0
+    hard_rate: float = 0.8
+    false_rate: float = 0.15
+    false_strength: float = 3.0
+
+
+@dataclass(frozen=True)
 class VoteModel:
     """Parameters of the two models; all shares and rates are probabilities.
 
@@ -42,7 +56,8 @@ class VoteModel:
     drives in which a false detection stays in place, seen at ``ghost_rate`` × found;
     ``strength``: how alike the frames of a drive are (beta-binomial pseudo-count, lower = more
     alike), ``false_strength`` the same of false detections, which clump; ``most_views``: frames
-    beyond which a drive's vote does not grow.
+    beyond which a drive's vote does not grow. ``prompted``: what differs at places that the
+    network was asked about.
     """
 
     found: float = 0.6
@@ -56,6 +71,12 @@ class VoteModel:
     strength: float = 8.0
     false_strength: float = 4.0
     most_views: float = 24.0
+    prompted: Prompted = field(default_factory=lambda: Prompted())
+
+    @property
+    def of_prompted(self) -> VoteModel:
+        """The model of places that the network was asked about."""
+        return replace(self, **vars(self.prompted))
 
 
 def _log_beta_binomial(hits: Array, misses: Array, rate: Array | float, strength: float) -> Array:
@@ -68,13 +89,22 @@ def _log_beta_binomial(hits: Array, misses: Array, rate: Array | float, strength
 
 
 def drive_log_likelihoods(
-    hits: Array, views: Array, model: VoteModel, picked: NDArray[np.bool_] | bool = False
+    hits: Array,
+    views: Array,
+    model: VoteModel,
+    picked: NDArray[np.bool_] | bool = False,
+    prompted: NDArray[np.bool_] | None = None,
 ) -> Array:
     """(3, ...) log-likelihoods of one drive's counts: exists and easy, exists and hard, absent.
 
-    ``picked`` marks places that are there because something was found. Without a view all three
-    are 0: never looked is no evidence.
+    ``picked`` marks places that are there because something was found, ``prompted`` those that the
+    network was asked about. Without a view all three are 0: never looked is no evidence.
     """
+    if prompted is not None and prompted.any():
+        out = drive_log_likelihoods(hits, views, model, picked)
+        own = hits[prompted], views[prompted]
+        out[:, prompted] = drive_log_likelihoods(*own, model.of_prompted)
+        return out
     views = np.maximum(views, 0.0)
     rate = np.clip(np.where(views > 0, hits / np.maximum(views, 1e-9), 0.0), 0.0, 1.0)
     n = np.minimum(views, model.most_views)
@@ -91,7 +121,11 @@ def drive_log_likelihoods(
 
 
 def joint_log_likelihoods(
-    hits: Array, views: Array, model: VoteModel, picked: NDArray[np.bool_]
+    hits: Array,
+    views: Array,
+    model: VoteModel,
+    picked: NDArray[np.bool_],
+    prompted: NDArray[np.bool_] | None = None,
 ) -> Array:
     """(3, n) log-likelihoods of the counts (drives, n) of all drives, as ``drive_log_likelihoods``.
 
@@ -100,7 +134,7 @@ def joint_log_likelihoods(
     or, at a share ``spill`` of the places, because all drives find false things there, which are
     detections of something beside it.
     """
-    each = drive_log_likelihoods(hits, views, model)
+    each = drive_log_likelihoods(hits, views, model, prompted=prompted)
     out: Array = each.sum(axis=1)
     looked = views[:, picked] > 0
     if looked.any():

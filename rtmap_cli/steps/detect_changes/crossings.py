@@ -361,10 +361,9 @@ def ring_counts(
         hit = owner >= 0
         asked = traversal.asked
         known = np.array([row.get(name, -1) for name in asked.element_id], np.int64)
-        key = np.concatenate(
-            [rings.frame[hit] * n + owner[hit], (asked.frame * n + known)[known >= 0]]
-        )
+        asked_key = (asked.frame * n + known)[known >= 0]
+        key = np.concatenate([rings.frame[hit] * n + owner[hit], asked_key])
         score = [rings.score[hit], asked.existence[known >= 0]]
         value = np.concatenate([detection_value(score[0]), answer_value(score[1])])
-        counts.append(count(n, seen, weight, key, value, np.concatenate(score)))
+        counts.append(count(n, seen, weight, key, value, np.concatenate(score), asked_key))
     return counts, owners

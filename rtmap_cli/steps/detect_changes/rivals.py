@@ -174,8 +174,9 @@ def _around(feet: Feet, stations: Stations, reach: int = 4) -> tuple[Array, Mask
 
 def _total(drives: Sequence[DriveCounts], model: VoteModel, picked: Mask) -> Array:
     """(3, n) log-likelihoods over some drives."""
-    hits, views = (np.stack([getattr(d, name) for d in drives]) for name in ("hits", "views"))
-    return joint_log_likelihoods(hits, views, model, picked)
+    names = ("hits", "views", "prompted")
+    hits, views, prompted = (np.stack([getattr(d, name) for d in drives]) for name in names)
+    return joint_log_likelihoods(hits, views, model, picked, prompted)
 
 
 def _marginal(votes: Array, model: VoteModel) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -78,10 +78,12 @@ class CellLooks:
 @dataclass(frozen=True)
 class DriveCounts:
     """One drive at n places: fractional ``hits`` of weighted ``views``, the ``looks`` behind these;
-    of every hit ``hit_place``, ``hit_frame``, ``hit_score``."""
+    of every hit ``hit_place``, ``hit_frame``, ``hit_score``. ``prompted`` (n,): most of the views
+    are of frames in which the network was asked about the place."""
 
     hits: Array
     views: Array
+    prompted: Mask
     looks: Looks
     hit_place: Int
     hit_frame: Int
@@ -111,8 +113,10 @@ def answer_value(existence: Array) -> Array:
     return np.clip((existence - SURE_NO) / (SURE_YES - SURE_NO), 0.0, 1.0)
 
 
-def count(n: int, seen: Views, weight: Array, key: Int, value: Array, score: Array) -> DriveCounts:
-    """Counts of ``n`` places from views and hits ``key`` = frame · n + place.
+def count(
+    n: int, seen: Views, weight: Array, key: Int, value: Array, score: Array, asked: Int
+) -> DriveCounts:
+    """Counts of ``n`` places from views; hits ``key``, questions ``asked``: frame · n + place.
 
     ``weight``: the detection probability of each view, relative to a good one: so many hits are
     expected of a place that exists, times its usual rate.
@@ -122,10 +126,16 @@ def count(n: int, seen: Views, weight: Array, key: Int, value: Array, score: Arr
     """
     view_key = seen.frame * n + seen.point
     key, value, score = _best_hits(key, value, score)
-    at = np.minimum(np.searchsorted(view_key, key), max(len(view_key) - 1, 0))
-    ok = view_key[at] == key if len(view_key) else np.zeros(len(key), bool)
+    ok = np.isin(key, view_key)
     views_ = np.bincount(seen.point, weight, n).astype(np.float64)
-    return _counted(n, PairLooks(seen.point, seen.frame), views_, key[ok], value[ok], score[ok])
+    looked = PairLooks(seen.point, seen.frame)
+    prompted = _prompted(n, np.intersect1d(asked, view_key), views_)
+    return _counted(n, looked, views_, prompted, key[ok], value[ok], score[ok])
+
+
+def _prompted(n: int, asked: Int, views_: Array) -> Mask:
+    """(n,) places at which at least half of the views have a question ``asked``."""
+    return (views_ > 0) & (2 * np.bincount(asked % n, minlength=n) >= views_)
 
 
 def _best_hits(key: Int, value: Array, score: Array) -> tuple[Int, Array, Array]:
@@ -140,11 +150,13 @@ def _best_hits(key: Int, value: Array, score: Array) -> tuple[Int, Array, Array]
 
 
 def _counted(
-    n: int, looked: Looks, views_: Array, key: Int, value: Array, score: Array
+    n: int, looked: Looks, views_: Array, prompted: Mask, key: Int, value: Array, score: Array
 ) -> DriveCounts:
-    frame, place = np.divmod(key, n)
-    hits = np.bincount(place, value, n).astype(np.float64)
-    return DriveCounts(hits, views_, looked, place, frame, score)
+    # An answer that there is nothing is no hit.
+    some = value > 0
+    frame, place = np.divmod(key[some], n)
+    hits = np.bincount(place, value[some], n).astype(np.float64)
+    return DriveCounts(hits, views_, prompted, looked, place, frame, score[some])
 
 
 def looks(stations: Stations, traversal: Traversal, margin: float) -> tuple[Views, Look]:
@@ -206,7 +218,8 @@ def line_counts(
     at, place = np.divmod(key, n)
     ok = outlook.sees_in_turn(at, cell[place], margin)
     looked = CellLooks(outlook, cell, margin)
-    return _counted(n, looked, views_, key[ok], value[ok], score[ok])
+    prompted = _prompted(n, np.intersect1d(key[ok], asked_key), views_)
+    return _counted(n, looked, views_, prompted, key[ok], value[ok], score[ok])
 
 
 def _covered(stations: Stations, samples: Samples, feet: Feet) -> tuple[Int, Array]:
@@ -354,6 +367,7 @@ def _without(drive: DriveCounts, old: int) -> DriveCounts:
     return DriveCounts(
         drive.hits * mask,
         drive.views * mask,
+        drive.prompted,
         _LaterLooks(drive.looks, old),
         drive.hit_place[hit],
         drive.hit_frame[hit],
@@ -378,17 +392,37 @@ def ballot(
         drives = [d if f else _without(d, old) for d, f in zip(drives, fresh, strict=True)]
     hits = np.stack([d.hits for d in drives])
     looked = np.stack([d.views for d in drives])
-    model = fitted(hits[:, :old:every], looked[:, :old:every], model)
+    prompted = np.stack([d.prompted for d in drives])
+    some = np.s_[:, :old:every]
+    model = _fitted_both(hits[some], looked[some], prompted[some], model)
     picked = np.arange(hits.shape[1]) >= old
-    votes = [drive_log_likelihoods(h, v, model, picked) for h, v in zip(hits, looked, strict=True)]
+    votes = [
+        drive_log_likelihoods(h, v, model, picked, p)
+        for h, v, p in zip(hits, looked, prompted, strict=True)
+    ]
+    usual = np.where(prompted, model.prompted.found, model.found)
     return Ballot(
         np.stack(votes),
-        joint_log_likelihoods(hits, looked, model, picked),
+        joint_log_likelihoods(hits, looked, model, picked, prompted),
         looked >= 1.0,
-        (looked > 0) & (hits >= SEEN_SHARE * model.found * looked),
+        (looked > 0) & (hits >= SEEN_SHARE * usual * looked),
         drives,
         [t.timestamp_ns for t in traversals],
         tuple(t.run_id for t in traversals),
         model,
         np.zeros(hits.shape[1]),
     )
+
+
+def _fitted_both(hits: Array, looked: Array, prompted: Mask, model: VoteModel) -> VoteModel:
+    """The model fitted to the map's places, those that the network was asked about on their own.
+
+    The few places of the map that a drive with questions was not asked about are no fair sample.
+    """
+    plain = np.logical_not(prompted.any(axis=1, keepdims=True))
+    own = fitted(hits * plain, looked * plain, model)
+    if not prompted.any():
+        return own
+    asked = fitted(hits * prompted, looked * prompted, model.of_prompted)
+    rates = replace(model.prompted, found=asked.found, strength=asked.strength)
+    return replace(own, hard=own.hard if plain.any() else asked.hard, prompted=rates)

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from rtmap_cli.errors import NoAnswer, UsageError
 from rtmap_cli.geometry.polylines import arc_length, is_ring, length, normals, resample, tangents
+from rtmap_cli.geometry.rings import polygon
 from rtmap_cli.maps.crs import to_lonlat
 from rtmap_cli.maps.element import CLASSES, RING_CLASSES, Element, VectorMap
 from rtmap_cli.steps.simulate.worlds.world import even_odd_surface
@@ -245,7 +246,7 @@ class _Work:
     def _insert_ring(self, class_name: str) -> bool:
         """A crossing straight across the road, at a right angle to the way."""
         old = [e.xy for e in self.elements.values() if e.class_name == class_name]
-        taken = shapely.union_all([shapely.polygons(p) for p in old]) if old else None
+        taken = shapely.union_all([polygon(p) for p in old]) if old else None
         for place, heading in self._places(200):
             along = np.array([np.cos(heading), np.sin(heading)])
             depth = self.rng.uniform(3.0, 4.4)
