@@ -44,11 +44,11 @@ def test_a_doubtful_detection_does_not_drive_out_a_sure_one() -> None:
     stations = stations_of([_line(0.0)])
     samples = _samples(_line(0.0), _line(0.4))
     sure = np.where(samples.detection == 1, 0.95, 0.2)
-    _, taken = assign_once(stations, replace(samples, score=sure))
+    _, taken = assign_once(stations, replace(samples, score=sure), by_score=True)
     assert taken.tolist() == [False] * 39 + [True] * 39
     # Where it lies far beside the line it does.
     samples = _samples(_line(0.0), _line(1.45))
-    _, taken = assign_once(stations, replace(samples, score=sure))
+    _, taken = assign_once(stations, replace(samples, score=sure), by_score=True)
     assert taken.tolist() == [True] * 39 + [False] * 39
 
 

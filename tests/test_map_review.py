@@ -16,7 +16,7 @@ from rtmap_cli.formats.changes import ChangeEvent, write_changes
 from rtmap_cli.geometry.polylines import length
 from rtmap_cli.maps import delta
 from rtmap_cli.maps.condition import parse_condition
-from rtmap_cli.maps.edits import Edit, apply_edits
+from rtmap_cli.maps.edits import Edit, apply_edits, together
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.evidence import Counts
 from rtmap_cli.maps.place import Place
@@ -320,6 +320,18 @@ def test_josm_saves_closed_lines_and_texts(
 def _edit(name: str, kind: str, element: Element, points: Any) -> Edit:
     element_id = None if kind == "insert" else element.element_id
     return Edit(name, kind, element.class_name, element_id, np.asarray(points, float))
+
+
+def test_of_stretches_that_overlap_the_first_one_is_made() -> None:
+    e = line("a")
+    ends = [[[0.1], [0.35]], [[0.3], [0.6]], [[0.6], [0.8]], [[0.9], [0.05]]]
+    edits = [
+        _edit(str(k), "delete", e, e.points[0] + (e.points[-1] - e.points[0]) * np.array(s))
+        for k, s in enumerate(ends)
+    ]
+    assert [x.change_id for x in together(e, edits)] == ["0", "2"]
+    assert [x.change_id for x in together(e, edits[::-1])] == ["3"]
+    apply_edits(VectorMap([e], CRS), together(e, edits), "f")
 
 
 def test_two_stretches_of_one_line_and_a_clash() -> None:

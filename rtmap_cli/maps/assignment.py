@@ -57,14 +57,16 @@ def assign_once(
     first: Mask | None = None,
     rounds: int = 4,
     wide: bool = True,
+    by_score: bool = False,
 ) -> tuple[Feet, Mask]:
     """Assign stretches of detections to strands, and say which samples found one.
 
     A detection goes to the strand of largest gain Σ spacing · (1 − (offset / gate)²); of those of
-    one frame at one place of a strand the one of largest mean gain times score stays. What is left
-    goes to the next one, for ``rounds`` rounds. With ``first`` (stations,) the lines of these
-    stations choose before all others. The gate is ``GATE``; ``wide``: ``WIDE`` sigmas of the usual
-    detection where that is more.
+    one frame at one place of a strand the one of largest mean gain stays (times its score, with
+    ``by_score``: a doubtful one does not drive out a sure one). What is left goes to the next
+    strand, for ``rounds`` rounds. With ``first`` (stations,) the lines of these stations choose
+    before all others. The gate is ``GATE``; ``wide``: ``WIDE`` sigmas of the usual detection where
+    that is more.
     """
     taken = np.zeros(len(samples), bool)
     parts: list[Feet] = []
@@ -72,7 +74,7 @@ def assign_once(
         gate = GATE
         if wide:
             gate = float(np.clip(WIDE * np.median(samples.across_sigma), GATE, 2 * GATE))
-        feet = _Feet(stations, samples, gate)
+        feet = _Feet(stations, samples, gate, by_score)
         stages = [None] if first is None else [first, ~first]
         for stage in stages:
             for _ in range(rounds):
@@ -91,7 +93,9 @@ def assign_once(
 class _Feet:
     """The best foot of each sample on each strand in reach, and which of them are still free."""
 
-    def __init__(self, stations: Stations, samples: Samples, gate: float) -> None:
+    def __init__(
+        self, stations: Stations, samples: Samples, gate: float, by_score: bool = False
+    ) -> None:
         unit = stations.strand
         feet = candidate_feet(stations, samples, gate, unit)
         self.sample, self.station, self.offset, self.along = feet
@@ -110,8 +114,9 @@ class _Feet:
         self.free = np.ones(len(self.sample), bool)
         total = np.bincount(samples.detection, samples.spacing)
         self.least = np.minimum(MIN_STRETCH, 0.6 * total)
-        self.score = np.zeros(len(total))
-        self.score[samples.detection] = samples.score
+        self.score = np.ones(len(total))
+        if by_score:
+            self.score[samples.detection] = samples.score
 
     def pick(self, index: Int) -> Feet:
         """Some of the feet."""
@@ -135,7 +140,6 @@ class _Feet:
         best = np.zeros(len(pairs), bool)
         best[order] = np.concatenate([[True], owner[order][1:] != owner[order][:-1]])
         wanted = (best & enough)[inverse]
-        # A doubtful detection, however near, does not drive out a sure one.
         mean = gain / np.maximum(cover, 1e-9) * self.score[owner]
         index, inverse = index[wanted], inverse[wanted]
         if not len(index):

@@ -109,6 +109,19 @@ def apply_edits(vector_map: VectorMap, edits: Sequence[Edit], where: str | Path)
     )
 
 
+def together(element: Element, edits: Sequence[Edit]) -> list[Edit]:
+    """Of some edits of an element those that can be made together: each unless it overlaps one
+    before it."""
+    if element.class_name in RING_CLASSES:
+        return list(edits[:1])
+    line = _turned(element, edits) if is_ring(element.points) else element
+    kept: list[_Cut] = []
+    for cut in (_cut(line, edit) for edit in edits):
+        if all(cut.start >= k.stop - REST or k.start >= cut.stop - REST for k in kept):
+            kept.append(cut)
+    return [cut.edit for cut in kept]
+
+
 def inserted_element(edit: Edit) -> Element:
     """The element of an insert; its id comes from the change, so that it is the same every time."""
     name = edit.element_id

@@ -40,7 +40,13 @@ from rtmap_cli.steps.detect_changes.lines import (
     new_lines,
     refit_lines,
 )
-from rtmap_cli.steps.detect_changes.rivals import neighbours, questioned, weighed, weighed_rings
+from rtmap_cli.steps.detect_changes.rivals import (
+    apart_from_known,
+    neighbours,
+    questioned,
+    weighed,
+    weighed_rings,
+)
 from rtmap_cli.steps.detect_changes.votes import Ballot, ballot, sight_of
 
 Array = NDArray[np.float64]
@@ -99,7 +105,7 @@ def _lines(
     seen = [t.samples(name) for t in traversals]
     samples = [registered(s, known) for s in seen]
     sigma = [offset_sigma(known, s) for s in samples]
-    feet = [assign_once(known, s)[0] for s in samples]
+    feet = [assign_once(known, s, by_score=True)[0] for s in samples]
     sight = sight_of(known, traversals, samples, feet, policy.view_margin_m)
     found = new_lines(name, known, traversals, samples)
     found = refit_lines(found, old, traversals, samples, settings.fusion)
@@ -363,6 +369,8 @@ def _rings(
     if len(found) and len(old):
         alone = ring_counts(places, ids, traversals, drives, first=len(old))
         votes = weighed_rings(votes, (counts, owners), alone, drives, places, len(old))
+        before = [prior_log_odds(e, settings.policy, newest_ns(traversals)) for e in prior]
+        votes = apart_from_known(votes, places, np.array(before))
     return [
         _ring_evidence(e, k, votes, settings, newest_ns(traversals), new=k >= len(prior))
         for k, e in enumerate(elements)

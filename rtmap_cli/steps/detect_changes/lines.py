@@ -59,7 +59,7 @@ def new_lines(
     """Polylines (n, 2) where detections that no prior line explains agree; not yet judged."""
     drives = []
     for s in samples:
-        _, taken = assign_once(prior, s)
+        _, taken = assign_once(prior, s, by_score=True)
         k = loose_stretches(s, taken, SHORTEST)
         drives.append(Marks(s.xy[k], s.tangent[k], s.spacing[k], s.across_sigma[k], s.score[k]))
     widths = np.concatenate([d.sigma for d in drives])
@@ -174,6 +174,6 @@ def all_line_counts(
     """
     counts, feet = [], []
     for traversal, s in zip(traversals, samples, strict=True):
-        feet.append(assign_once(stations, s, first, wide=wide)[0])
+        feet.append(assign_once(stations, s, first, wide=wide, by_score=True)[0])
         counts.append(line_counts(stations, ids, traversal, s, feet[-1], margin, sight))
     return Play(counts, feet)

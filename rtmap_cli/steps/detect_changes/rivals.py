@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rtmap_cli.geometry.rings import polygons
 from rtmap_cli.maps.existence import (
     PRIOR_LOG_ODDS,
     VoteModel,
@@ -36,6 +37,8 @@ BESIDE = 2 * GATE
 """Lines nearer to each other than this (m) compete for detections."""
 RING_BESIDE = 8.0
 """Centres of crossings nearer than this (m) compete for detections."""
+OVERLAP = 0.2
+"""Crossings that have this share of the smaller one in common cannot both exist."""
 MOST = 2.0
 """Log-odds that the offset of a whole drive is worth at most: errors have heavy tails."""
 OWN, CUT = 0.5, 1.3
@@ -229,4 +232,26 @@ def weighed_rings(
         strain = np.bincount(one[moved], far / rings.variance[moved] / 2, len(places))
         share = number / np.maximum(np.bincount(one[one >= 0], minlength=len(places)), 1)
         extra += share * np.clip(strain / np.maximum(number, 1), -MOST, MOST)
+    return replace(votes, extra=extra)
+
+
+def apart_from_known(votes: Ballot, places: Array, before: Array) -> Ballot:
+    """The votes on closed elements ``places`` (n, 80, 2), of which the first lie on the map with
+    log-odds ``before`` (k,): a new one that overlaps one of them exists only where that does not.
+
+    Of old alone, new alone and neither with log-odds a, b and 0 the new one has b − log(1 + eᵃ).
+    """
+    import shapely
+
+    k = len(before)
+    known = before + votes.evidence[:k]
+    shapes = polygons(places)
+    new, old = shapely.STRtree(shapes[:k]).query(shapes[k:])
+    common = shapely.area(shapely.intersection(shapes[k + new], shapes[old]))
+    area = shapely.area(shapes)
+    over = common > OVERLAP * np.minimum(area[k + new], area[old])
+    strongest = np.full(len(places) - k, -np.inf)
+    np.maximum.at(strongest, new[over], known[old[over]])
+    extra = votes.extra.copy()
+    extra[k:] -= np.logaddexp(0.0, strongest)
     return replace(votes, extra=extra)

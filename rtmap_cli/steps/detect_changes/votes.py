@@ -31,7 +31,9 @@ Mask = NDArray[np.bool_]
 TOGETHER = 3
 """Feet of a detection that are so many stations apart, or nearer, cover those between them."""
 SEEN_SHARE = 0.3
-"""A drive has seen a place when it found something in this share of the usual rate."""
+"""A drive has seen a place when it found something in this share of the usual rate, ..."""
+SEEN_PROMPTED = 0.6
+"""... or in this one where its network was asked about the place, and easier to deceive."""
 CONFIRMED = 0.35
 """A line found by this share of the frames that looked is there."""
 NOISE_SCORE = 0.1
@@ -400,12 +402,12 @@ def ballot(
         drive_log_likelihoods(h, v, model, picked, p)
         for h, v, p in zip(hits, looked, prompted, strict=True)
     ]
-    usual = np.where(prompted, model.prompted.found, model.found)
+    enough = np.where(prompted, SEEN_PROMPTED * model.prompted.found, SEEN_SHARE * model.found)
     return Ballot(
         np.stack(votes),
         joint_log_likelihoods(hits, looked, model, picked, prompted),
         looked >= 1.0,
-        (looked > 0) & (hits >= SEEN_SHARE * usual * looked),
+        (looked > 0) & (hits >= enough * looked),
         drives,
         [t.timestamp_ns for t in traversals],
         tuple(t.run_id for t in traversals),

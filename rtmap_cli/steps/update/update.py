@@ -14,6 +14,7 @@ from rtmap_cli.formats.changes import ChangeEvent
 from rtmap_cli.geometry.blocks import Layout
 from rtmap_cli.geometry.polylines import is_ring
 from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.edits import Edit, together
 from rtmap_cli.maps.element import RING_CLASSES, VectorMap
 from rtmap_cli.maps.evidence import Counts
 from rtmap_cli.maps.existence import probability
@@ -82,6 +83,8 @@ def update(
     least = settings.min_probability
     events = [(e, s.reason) for s, e in told if id(s) in flagged and e.probability >= least]
     events.sort(key=lambda x: (-x[0].probability, x[0].change_id))
+    apart = _without_overlaps([e for e, _ in events], near)
+    events = [(e, reason) for e, reason in events if e.change_id in apart]
     reasons = {e.change_id: reason for e, reason in events}
     return Update(heat, lines, cells, [e for e, _ in events], reasons)
 
@@ -131,6 +134,18 @@ def _named_apart(told: list[tuple[Stretch, ChangeEvent]]) -> list[tuple[Stretch,
         count[event.change_id] += 1
         out.append((stretch, replace(event, change_id=f"{event.change_id}-{k}") if k else event))
     return out
+
+
+def _without_overlaps(events: Sequence[ChangeEvent], old: VectorMap) -> set[str]:
+    """The ids of changes that can be made together, the first ones first: where a stretch lies now
+    may reach beside the next one, which is then no change of its own."""
+    by_element: dict[str, list[Edit]] = {}
+    for e in events:
+        edit = Edit(e.change_id, e.kind, e.class_name, e.element_id, e.points)
+        by_element.setdefault(e.element_id or e.change_id, []).append(edit)
+    known = old.by_id()
+    parts = [together(known[k], v) if k in known else v for k, v in by_element.items()]
+    return {edit.change_id for part in parts for edit in part}
 
 
 def _bounded(event: ChangeEvent, most: float) -> ChangeEvent:
