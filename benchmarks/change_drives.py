@@ -1,14 +1,17 @@
 """Change detection over drives with known changes: bars, operating points, calibration.
 
     python benchmarks/change_drives.py                 20 worlds of three drives, three changes each
+    python benchmarks/change_drives.py --prior-queries the network is asked about the map
     python benchmarks/change_drives.py --worlds 4 --jobs 2 --json changes.json
 
 Worlds are the maps of three Argoverse 2 logs (RTMAP_DATA, or --data) with changes made by `rtmap
 simulate changes`; drives and observations are simulated (presets rtmap-straight, rtmap-turning),
-prior maps are off by 0.1 m. Every drive is localized on the outdated map and judged alone ("after
-one traversal": all three, each by itself) and together. A change counts for the drives that saw it:
-four frames or more within 14 m of its middle. Runs and figures are kept in --work under digests of
-the code behind them. Ends with a line PASS or FAIL for each bar; exit code 1 when one fails.
+prior maps are off by 0.1 m. With --prior-queries the observations are those of a network that was
+given the outdated map, as `rtmap infer --map` gives it. Every drive is localized on the outdated
+map and judged alone ("after one traversal": all three, each by itself) and together. A change
+counts for the drives that saw it: four frames or more within 14 m of its middle. Runs and figures
+are kept in --work under digests of the code behind them. Ends with a line PASS or FAIL for each
+bar; exit code 1 when one fails.
 """
 
 from __future__ import annotations
@@ -78,7 +81,7 @@ def places(data: Path) -> list[Place]:
     return av2_places(data)
 
 
-def make_runs(world: int, data: Path, folder: Path) -> None:
+def make_runs(world: int, data: Path, folder: Path, prior_queries: bool = False) -> None:
     """Outdated map, truth and localized drives of a world; nothing where they are there."""
     if (folder / "done").exists():
         return
@@ -86,10 +89,12 @@ def make_runs(world: int, data: Path, folder: Path) -> None:
     specs = [parse_spec(CHANGES[(world + k) % len(CHANGES)]) for k in range(PER_WORLD)]
     old, changes, keys = outdated(place, kind, world, world, specs, DRIVES)
     folder.mkdir(parents=True, exist_ok=True)
-    write_new_map(degrade_map(old, 0.1, world), folder / "prior", "outdated", overwrite=True)
+    prior = degrade_map(old, 0.1, world)
+    write_new_map(prior, folder / "prior", "outdated", overwrite=True)
+    asked = prior if prior_queries else None
     paths = []
     for n, key in enumerate(keys):
-        d = drive_through(place, kind, key, folder / f"{n:02d}")
+        d = drive_through(place, kind, key, folder / f"{n:02d}", asked)
         command("localize", d.run, "--map", folder / "prior", "--smooth")
         paths.append(d.drive.pose[:, :2, 3])
     truth = truth_json(changes, place.world.crs)
@@ -102,14 +107,16 @@ def make_runs(world: int, data: Path, folder: Path) -> None:
     (folder / "done").touch()
 
 
-def judge_world(world: int, data: Path, runs: Path, keep: Path) -> dict[str, Any]:
+def judge_world(
+    world: int, data: Path, runs: Path, keep: Path, prior_queries: bool = False
+) -> dict[str, Any]:
     """What is told of a world from each drive alone and from all of them."""
     path = keep / f"{world:02d}.json"
     if path.exists():
         out: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         return out
     folder = runs / f"{world:02d}"
-    make_runs(world, data, folder)
+    make_runs(world, data, folder, prior_queries)
     groups = [[k] for k in range(DRIVES)] + [list(range(DRIVES))]
     answers = [judged(folder, group) for group in groups]
     keep.mkdir(parents=True, exist_ok=True)
@@ -257,6 +264,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--data", type=Path, default=os.environ.get("RTMAP_DATA") or None)
     parser.add_argument("--worlds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="number (and seed) of the first world")
+    parser.add_argument("--prior-queries", action="store_true")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--work", type=Path, default=Path("bench_changes"), help="what is kept")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
@@ -268,16 +276,18 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The worlds one after the other, or by ``--jobs`` processes."""
-    runs = options.work / f"runs-{digest(RUNS_CODE)}"
-    keep = options.work / f"figures-{digest(CODE)}"
+    kind = "-asked" if options.prior_queries else ""
+    runs = options.work / f"runs{kind}-{digest(RUNS_CODE)}"
+    keep = options.work / f"figures{kind}-{digest(CODE)}"
+    common = options.data, runs, keep, options.prior_queries
     worlds = range(options.first, options.first + options.worlds)
     if options.jobs == 1:
         for world in worlds:
-            yield judge_world(world, options.data, runs, keep)
+            yield judge_world(world, *common)
         return
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
-        jobs = [pool.submit(judge_world, w, options.data, runs, keep) for w in worlds]
+        jobs = [pool.submit(judge_world, w, *common) for w in worlds]
         for job in jobs:
             yield job.result()
 

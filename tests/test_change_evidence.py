@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fusion_scene import CRS, ORIGIN, drive, line, save, street
+from fusion_scene import CRS, ORIGIN, drive, line, save, shifted, street
 
 from rtmap_cli.formats.changes import ChangeEvent
-from rtmap_cli.logs.run import MATCHED, Run
+from rtmap_cli.logs.run import MATCHED, NEW, Observations, Run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.evidence import Counts, DriveEvidence, Policy, prior_log_odds
 from rtmap_cli.maps.policy import read_policy
@@ -120,6 +120,30 @@ def test_what_a_network_sees_that_was_not_asked_is_found_less_often(
     runs = [drive(street(), f"d{k}", seed=k, prior=prior, found=0.45) for k in range(2)]
     (found,) = _told(rtmap, tmp_path, prior, runs)
     assert (found["properties"]["kind"], found["properties"]["class"]) == ("insert", "ped_crossing")
+
+
+def test_an_answer_about_a_line_is_no_line_of_its_own(rtmap: Call, tmp_path: Path) -> None:
+    # The map is off by 0.6 m: what the network says of a line must not make a second one beside it.
+    prior = shifted(street(), 0.0, 0.6)
+    runs = [drive(street(), f"d{k}", seed=k, prior=prior) for k in range(2)]
+    for k, run in enumerate(runs):
+        # Answers lie where the lines are, and a doubtful second find lies on the map's line.
+        o = run.observations
+        answers = o.select(np.isfinite(o.existence) & (o.class_name == "divider"))
+        doubtful = replace(
+            answers,
+            state=np.full(len(answers), NEW, np.int8),
+            score=np.full(len(answers), 0.25, np.float32),
+            existence=np.full(len(answers), np.nan, np.float32),
+            element_id=np.full(len(answers), None),
+            prior_points=np.full_like(answers.prior_points, np.nan),
+        )
+        moved = np.where(
+            o.existence[:, None, None] > 0, o.points - np.float32([0.0, 0.6]), o.points
+        )
+        joined = Observations.concatenate([replace(o, points=moved.astype(np.float32)), doubtful])
+        runs[k] = replace(run, observations=joined)
+    assert _told(rtmap, tmp_path, prior, runs) == []
 
 
 def test_a_drive_that_never_looks_leaves_existence_as_it_is(rtmap: Call, tmp_path: Path) -> None:

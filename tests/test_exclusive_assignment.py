@@ -40,15 +40,23 @@ def test_of_two_detections_of_a_frame_the_nearer_keeps_the_line() -> None:
     assert taken.all()
 
 
-def test_a_doubtful_detection_does_not_drive_out_a_sure_one() -> None:
+def test_what_is_named_goes_to_its_line_and_a_doubtful_one_does_not_drive_it_out() -> None:
     stations = stations_of([_line(0.0)])
     samples = _samples(_line(0.0), _line(0.4))
     sure = np.where(samples.detection == 1, 0.95, 0.2)
-    _, taken = assign_once(stations, replace(samples, score=sure), by_score=True)
+    own = np.where(samples.detection == 1, 0, -1)
+    _, taken = assign_once(stations, replace(samples, score=sure), own=own)
     assert taken.tolist() == [False] * 39 + [True] * 39
+    # It goes there past a nearer line; out of its reach it goes to any.
+    stations = stations_of([_line(0.0), _line(1.0)])
+    feet, _ = assign_once(stations, _samples(_line(0.9)), own=np.zeros(39, np.int64))
+    assert set(stations.line[feet.station]) == {0}
+    feet, _ = assign_once(stations, _samples(_line(1.6)), own=np.zeros(39, np.int64))
+    assert set(stations.line[feet.station]) == {1}
     # Where it lies far beside the line it does.
+    stations = stations_of([_line(0.0)])
     samples = _samples(_line(0.0), _line(1.45))
-    _, taken = assign_once(stations, replace(samples, score=sure), by_score=True)
+    _, taken = assign_once(stations, replace(samples, score=sure), own=own)
     assert taken.tolist() == [True] * 39 + [False] * 39
 
 

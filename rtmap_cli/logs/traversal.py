@@ -43,7 +43,8 @@ class Traversal:
     ``asked``: prior elements that the network was asked about, see ``Questions``. ``cut`` (n,):
     reaches the border of the range; ``localized``: the poses come from localization; ``classes``
     that its model knows: of others its silence says nothing; ``motion``: what GNSS and odometry
-    say of a drive that was not localized.
+    say of a drive that was not localized; ``answer`` (n,): id of the prior element that the network
+    says an element is, None for new ones (empty: no questions).
     """
 
     run_id: str
@@ -63,6 +64,7 @@ class Traversal:
     model_sha256: str | None = None
     classes: tuple[str, ...] = ()
     motion: Motion | None = None
+    answer: NDArray[Any] = field(default_factory=lambda: np.zeros(0, object))
     sampled: dict[str, Samples] = field(default_factory=dict, repr=False, compare=False, init=False)
 
     def __len__(self) -> int:
@@ -92,6 +94,14 @@ class Traversal:
                 self.points[k], self.covariance[k], self.score[k], self.frame[k]
             )
         return self.sampled[class_name]
+
+    def answered(self, class_name: str, ids: Sequence[str]) -> Int:
+        """(samples of the class,) index in ``ids`` of the prior element that the network says each
+        is, -1 for others."""
+        row = {name: k for k, name in enumerate(ids) if name}
+        said = self.answer[self.class_name == class_name] if len(self.answer) else ()
+        codes = np.array([row.get(name, -1) for name in said], np.int64)
+        return np.repeat(codes, 2 * self.points.shape[1] - 1)
 
     def moved(self, pose: Array, pose_covariance: Array) -> Traversal:
         """The drive at other poses (m, 3) with other covariances (m, 3, 3), and what it saw."""
@@ -253,6 +263,7 @@ def traversal_of(run: Run, min_score: float = FOUND_SCORE) -> Traversal:
         model_sha256=run.info.get("model_sha256"),
         classes=tuple(str(c) for c in run.info["classes"]),
         motion=None if run.poses is not None else motion_of(run.frames, pose, MotionModel()),
+        answer=o.element_id[detected] if asked.any() else np.zeros(0, object),
     )
 
 

@@ -57,16 +57,16 @@ def assign_once(
     first: Mask | None = None,
     rounds: int = 4,
     wide: bool = True,
-    by_score: bool = False,
+    own: Int | None = None,
 ) -> tuple[Feet, Mask]:
     """Assign stretches of detections to strands, and say which samples found one.
 
     A detection goes to the strand of largest gain Σ spacing · (1 − (offset / gate)²); of those of
-    one frame at one place of a strand the one of largest mean gain stays (times its score, with
-    ``by_score``: a doubtful one does not drive out a sure one). What is left goes to the next
-    strand, for ``rounds`` rounds. With ``first`` (stations,) the lines of these stations choose
+    one frame at one place of a strand the one of largest mean gain stays. What is left goes to the
+    next one, for ``rounds`` rounds. With ``first`` (stations,) the lines of these stations choose
     before all others. The gate is ``GATE``; ``wide``: ``WIDE`` sigmas of the usual detection where
-    that is more.
+    that is more. ``own`` (samples,): the line that the network says a sample is, -1: none; it goes
+    there when that is in reach, and a doubtful detection does not drive out a sure one.
     """
     taken = np.zeros(len(samples), bool)
     parts: list[Feet] = []
@@ -74,7 +74,7 @@ def assign_once(
         gate = GATE
         if wide:
             gate = float(np.clip(WIDE * np.median(samples.across_sigma), GATE, 2 * GATE))
-        feet = _Feet(stations, samples, gate, by_score)
+        feet = _Feet(stations, samples, gate, own)
         stages = [None] if first is None else [first, ~first]
         for stage in stages:
             for _ in range(rounds):
@@ -94,11 +94,19 @@ class _Feet:
     """The best foot of each sample on each strand in reach, and which of them are still free."""
 
     def __init__(
-        self, stations: Stations, samples: Samples, gate: float, by_score: bool = False
+        self,
+        stations: Stations,
+        samples: Samples,
+        gate: float,
+        own: Int | None = None,
     ) -> None:
         unit = stations.strand
-        feet = candidate_feet(stations, samples, gate, unit)
-        self.sample, self.station, self.offset, self.along = feet
+        feet = Feet(*candidate_feet(stations, samples, gate, unit))
+        named = own is not None and bool((own >= 0).any())
+        if own is not None and named:
+            feet = _faithful(feet, stations, own)
+        self.sample, self.station = feet.sample, feet.station
+        self.offset, self.along = feet.offset, feet.along
         self.weight = samples.spacing[self.sample]
         self.gain = 1.0 - (self.offset / gate) ** 2
         self.detection = samples.detection[self.sample]
@@ -115,7 +123,7 @@ class _Feet:
         total = np.bincount(samples.detection, samples.spacing)
         self.least = np.minimum(MIN_STRETCH, 0.6 * total)
         self.score = np.ones(len(total))
-        if by_score:
+        if named:
             self.score[samples.detection] = samples.score
 
     def pick(self, index: Int) -> Feet:
@@ -194,3 +202,16 @@ class _Feet:
         out = np.zeros(len(index), bool)
         out[order] = detection[order] == best
         return out
+
+
+def _faithful(feet: Feet, stations: Stations, own: Int) -> Feet:
+    """The feet without those on other chains than that of the sample's ``own`` line, where it has
+    one there."""
+    chain = np.full(int(stations.line.max()) + 2, -1)
+    chain[stations.line] = stations.chain
+    # The last entry stands for samples that are no line's own.
+    mine = (own[feet.sample] >= 0) & (chain[own[feet.sample]] == stations.chain[feet.station])
+    has = np.zeros(len(own), bool)
+    has[feet.sample[mine]] = True
+    keep = mine | ~has[feet.sample]
+    return Feet(feet.sample[keep], feet.station[keep], feet.offset[keep], feet.along[keep])

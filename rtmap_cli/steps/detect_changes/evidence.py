@@ -105,9 +105,10 @@ def _lines(
     seen = [t.samples(name) for t in traversals]
     samples = [registered(s, known) for s in seen]
     sigma = [offset_sigma(known, s) for s in samples]
-    feet = [assign_once(known, s, by_score=True)[0] for s in samples]
+    owns = [t.answered(name, [e.element_id for e in prior]) for t in traversals]
+    feet = [assign_once(known, s, own=own)[0] for s, own in zip(samples, owns, strict=True)]
     sight = sight_of(known, traversals, samples, feet, policy.view_margin_m)
-    found = new_lines(name, known, traversals, samples)
+    found = new_lines(name, known, traversals, samples, owns)
     found = refit_lines(found, old, traversals, samples, settings.fusion)
     found = split_doubles(found, old, samples)
     for _ in range(2):
@@ -118,7 +119,7 @@ def _lines(
             return []
         ids = [e.element_id for e in prior] + [""] * len(found)
         votes = _line_votes(
-            stations, ids, len(old), traversals, samples, sigma, sight, fresh, settings
+            stations, ids, len(old), traversals, samples, owns, sigma, sight, fresh, settings
         )
         if last:
             break
@@ -142,16 +143,17 @@ def _line_votes(
     old: int,
     traversals: Sequence[Traversal],
     samples: Sequence[Samples],
+    owns: Sequence[NDArray[np.int64]],
     sigma: Sequence[Array],
     sight: SightModel,
     fresh: NDArray[np.bool_],
     settings: Settings,
 ) -> Ballot:
     """The votes on all stations, the first ``old`` lines being those of the prior; ``sigma`` of
-    every drive's samples as ``offset_sigma`` has it."""
+    every drive's samples as ``offset_sigma`` has it, ``owns`` as for ``all_line_counts``."""
     before = int(np.searchsorted(stations.line, old))
     margin = settings.policy.view_margin_m
-    drives = stations, ids, traversals, samples, margin, sight
+    drives = stations, ids, traversals, samples, owns, margin, sight
     # Lines that are all new part best by what is nearest; known ones may be seen farther off.
     full = all_line_counts(*drives, wide=old > 0)
     votes = ballot(full.counts, traversals, settings.votes, fresh, before, APART)

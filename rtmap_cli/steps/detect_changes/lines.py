@@ -55,11 +55,13 @@ def new_lines(
     prior: Stations,
     traversals: Sequence[Traversal],
     samples: Sequence[Samples],
+    owns: Sequence[Int],
 ) -> list[Array]:
-    """Polylines (n, 2) where detections that no prior line explains agree; not yet judged."""
+    """Polylines (n, 2) where detections that no prior line explains agree; not yet judged. ``owns``
+    as for ``all_line_counts``."""
     drives = []
-    for s in samples:
-        _, taken = assign_once(prior, s, by_score=True)
+    for s, own in zip(samples, owns, strict=True):
+        _, taken = assign_once(prior, s, own=own)
         k = loose_stretches(s, taken, SHORTEST)
         drives.append(Marks(s.xy[k], s.tangent[k], s.spacing[k], s.across_sigma[k], s.score[k]))
     widths = np.concatenate([d.sigma for d in drives])
@@ -162,6 +164,7 @@ def all_line_counts(
     ids: Sequence[str],
     traversals: Sequence[Traversal],
     samples: Sequence[Samples],
+    owns: Sequence[Int],
     margin: float,
     sight: SightModel,
     first: NDArray[np.bool_] | None = None,
@@ -169,11 +172,11 @@ def all_line_counts(
 ) -> Play:
     """Counts of every drive at all stations; every detection goes to one line only.
 
-    With ``first`` (stations,) these choose their detections before the others. ``wide`` as in
-    ``assign_once``.
+    ``owns``: of every drive the line that the network says each sample is, -1: none. With ``first``
+    (stations,) these choose their detections before the others. ``wide`` as in ``assign_once``.
     """
     counts, feet = [], []
-    for traversal, s in zip(traversals, samples, strict=True):
-        feet.append(assign_once(stations, s, first, wide=wide, by_score=True)[0])
+    for traversal, s, own in zip(traversals, samples, owns, strict=True):
+        feet.append(assign_once(stations, s, first, wide=wide, own=own)[0])
         counts.append(line_counts(stations, ids, traversal, s, feet[-1], margin, sight))
     return Play(counts, feet)

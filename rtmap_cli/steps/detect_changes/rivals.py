@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.rings import polygons
 from rtmap_cli.maps.existence import (
+    LIMIT,
     PRIOR_LOG_ODDS,
     VoteModel,
     joint_log_likelihoods,
@@ -237,14 +238,15 @@ def weighed_rings(
 
 def apart_from_known(votes: Ballot, places: Array, before: Array) -> Ballot:
     """The votes on closed elements ``places`` (n, 80, 2), of which the first lie on the map with
-    log-odds ``before`` (k,): a new one that overlaps one of them exists only where that does not.
+    log-odds ``before`` (k,): a new one that overlaps one of them exists only where that does not,
+    and is what was seen of it where no drive had enough of that in view to judge it.
 
     Of old alone, new alone and neither with log-odds a, b and 0 the new one has b − log(1 + eᵃ).
     """
     import shapely
 
     k = len(before)
-    known = before + votes.evidence[:k]
+    known = np.where(votes.views[:k] > 0, before + votes.evidence[:k], LIMIT)
     shapes = polygons(places)
     new, old = shapely.STRtree(shapes[:k]).query(shapes[k:])
     common = shapely.area(shapely.intersection(shapes[k + new], shapes[old]))

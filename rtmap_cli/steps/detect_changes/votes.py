@@ -42,6 +42,10 @@ SURE_NO, SURE_YES = 0.15, 0.85
 """… nor does an existence up to the first; from the second on the network is sure."""
 
 
+GLANCE = 6.0
+"""Fewer views are of the border of the range, where answers are worse than usual."""
+
+
 class Looks(Protocol):
     """Which frames could see places."""
 
@@ -136,8 +140,9 @@ def count(
 
 
 def _prompted(n: int, asked: Int, views_: Array) -> Mask:
-    """(n,) places at which at least half of the views have a question ``asked``."""
-    return (views_ > 0) & (2 * np.bincount(asked % n, minlength=n) >= views_)
+    """(n,) places at which at least half of the views have a question ``asked``, and that were not
+    only glanced at."""
+    return (views_ >= GLANCE) & (2 * np.bincount(asked % n, minlength=n) >= views_)
 
 
 def _best_hits(key: Int, value: Array, score: Array) -> tuple[Int, Array, Array]:
