@@ -27,8 +27,9 @@ from rtmap_cli.geometry.polylines import arc_length
 from rtmap_cli.logs.cloud import CloudFolder
 from rtmap_cli.logs.native import NativeLog
 from rtmap_cli.output import table
-from rtmap_cli.steps.label.cloud.build import Builder, Settings
+from rtmap_cli.steps.label.cloud.build import Builder
 from rtmap_cli.steps.label.cloud.exports import write_overview, write_ply_of
+from rtmap_cli.steps.label.cloud.track import Settings
 
 STAGES = ("odometry", "graph", "map", "exports")
 

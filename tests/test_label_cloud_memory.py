@@ -13,10 +13,11 @@ import pytest
 from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.logs.cloud import Voxels
 from rtmap_cli.logs.native import NativeLog
-from rtmap_cli.steps.label.cloud.build import Builder, Settings
+from rtmap_cli.steps.label.cloud.build import Builder
 from rtmap_cli.steps.label.cloud.graph import Edges, solve
 from rtmap_cli.steps.label.cloud.mapping import VoxelMap
 from rtmap_cli.steps.label.cloud.odometry import Odometry
+from rtmap_cli.steps.label.cloud.track import Settings
 
 
 def test_points_of_a_sweep_do_not_stay(tmp_path: Path, monkeypatch: Any) -> None:

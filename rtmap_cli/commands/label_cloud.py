@@ -78,8 +78,9 @@ def command(
     """  # fmt: skip
     from rtmap_cli.logs.cloud import CloudFolder
     from rtmap_cli.logs.open import folder_of, open_log
-    from rtmap_cli.steps.label.cloud.build import Builder, Settings
+    from rtmap_cli.steps.label.cloud.build import Builder
     from rtmap_cli.steps.label.cloud.exports import write_laz_of, write_overview, write_ply_of
+    from rtmap_cli.steps.label.cloud.track import Settings
     from rtmap_cli.tables import refuse_existing, refuse_over, whole_folder
 
     refuse_over(output, folder_of(log_path))

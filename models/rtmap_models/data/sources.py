@@ -13,7 +13,6 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -33,24 +32,12 @@ from rtmap_cli.steps.infer.images import FittedCamera
 from rtmap_cli.steps.infer.levelling import RoadUnder
 from rtmap_cli.tables import whole_folder
 from rtmap_models.config import ModelConfig, SemanticConfig
+from rtmap_models.data.jobs import SHARD_FRAMES, LogJob, true_poses
 from rtmap_models.data.samples import Array
 from rtmap_models.data.views import Pictures, View, scene_at
 
-SHARD_FRAMES = 24
-
 SPACING_M = 1.0
 """Frames of a log nearer than this to the last one taken are left out: nothing new in them."""
-
-
-class LogJob(NamedTuple):
-    """One log to be turned into frames in ``folder``."""
-
-    spec: str
-    folder: Path
-    config: ModelConfig
-    map_path: Path | None
-    spacing_m: float
-    keep_images: bool
 
 
 def gather(
@@ -235,15 +222,6 @@ def _cameras_of(
                 raise BadInput(error.where, error.what, "mend the image or take it away") from None
             projections[k] = camera.at(frame.ego_SE3_exposure.get(name))
     return images, projections
-
-
-def true_poses(log: Log) -> dict[int, Array] | None:
-    """Poses that a simulator or a survey laid beside a log, by frame."""
-    read = getattr(log, "truth_poses", None)
-    poses = read() if read is not None else None
-    if poses is None:
-        return None
-    return {int(k): pose for k, pose in zip(poses.frame, poses.pose, strict=True)}
 
 
 def truth_of_log(job: LogJob, log: Log) -> VectorMap:

@@ -13,9 +13,9 @@ from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.steps.infer.rasters import LogRasters, RasterSpec
 from rtmap_cli.tables import whole_folder
 from rtmap_models.config import SemanticConfig
+from rtmap_models.data.jobs import SHARD_FRAMES, LogJob, true_poses
 from rtmap_models.data.samples import Scene
 from rtmap_models.data.shards import write_shard
-from rtmap_models.data.sources import SHARD_FRAMES, LogJob, true_poses
 from rtmap_models.data.views import scene_at
 from rtmap_models.semantic.picture import wide_picture
 

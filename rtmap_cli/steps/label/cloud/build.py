@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from rtmap_cli.steps.label.cloud.georeference import Reference, place_in_map
 from rtmap_cli.steps.label.cloud.mapping import TILE, VoxelMap
 from rtmap_cli.steps.label.cloud.odometry import DEGENERATE, LOST, Odometry, Step
 from rtmap_cli.steps.label.cloud.points import Sweep, cleaned, deskewed, thinned
+from rtmap_cli.steps.label.cloud.track import Settings, Track
 
 Array = NDArray[np.float64]
 Progress = Callable[[Iterator[Any], str, int], Iterator[Any]]
@@ -29,43 +30,6 @@ FEWEST = 100
 """A sweep of fewer points is not looked at."""
 MOST_WEAK = 0.5
 """With nothing but the sweeps to go by, a drive of which more is degenerate has no answer."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """``method`` of `METHODS`, side of a ``voxel`` of the map and of a ``leaf`` of matched sweeps
-    (m; None: by the first sweep), whether to use ``gnss``, ``odometry`` and ``loops``, the range
-    of points that enter the ``map`` (m)."""
-
-    method: str = "vgicp"
-    voxel: float = 0.1
-    leaf: float | None = None
-    gnss: bool = True
-    odometry: bool = True
-    loops: bool = True
-    reach: float = 60.0
-
-
-@dataclass
-class Track:
-    """What the odometry found, sweep by sweep, in the local frame of the drive."""
-
-    frames: list[Frame]
-    local: Array
-    information: Array
-    status: NDArray[np.object_]
-    weak: Array
-    keyframe: NDArray[np.bool_]
-    cost: Array
-    turn: NDArray[np.bool_]
-
-    def open(self) -> str:
-        """What the sweeps do not tell, in words."""
-        if not np.isfinite(self.weak).any():
-            return "turn" if self.turn.any() else "motion"
-        axis = np.nanmean(np.abs(self.weak), axis=0)
-        way = ("forward", "sideways", "upward")[int(np.nanargmax(axis))]
-        return f"motion {way}" + (", nor the turn" if self.turn.any() else "")
 
 
 def sweep_of(log: Log, frame: Frame) -> Sweep | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry import lie
 from rtmap_cli.geometry.poses import invert
-from rtmap_cli.steps.label.cloud.match import Match
+from rtmap_cli.steps.label.cloud.matcher import Match
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from rtmap_cli.steps.label.cloud.jumps import consistent
 from rtmap_cli.steps.label.cloud.loops import Loop, candidates, verify
 
 if TYPE_CHECKING:
-    from rtmap_cli.steps.label.cloud.build import Settings, Track
+    from rtmap_cli.steps.label.cloud.track import Settings, Track
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from rtmap_cli.geometry.polylines import arc_length
 from rtmap_cli.geometry.poses import invert, transform
 from rtmap_cli.steps.label.cloud.degenerate import spectrum
-from rtmap_cli.steps.label.cloud.match import Match, best_start, make_matcher
+from rtmap_cli.steps.label.cloud.match import best_start, make_matcher
+from rtmap_cli.steps.label.cloud.matcher import Match
 from rtmap_cli.steps.label.cloud.place import starts
 
 Array = NDArray[np.float64]

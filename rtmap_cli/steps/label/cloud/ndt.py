@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry import lie
 from rtmap_cli.geometry.poses import transform
-from rtmap_cli.steps.label.cloud.match import ITERATIONS, Match, judged
+from rtmap_cli.steps.label.cloud.matcher import ITERATIONS, Match, judged
 from rtmap_cli.steps.label.cloud.points import cell_keys, thinned
 
 Array = NDArray[np.float64]

@@ -19,7 +19,8 @@ from rtmap_cli.steps.label.cloud.degenerate import (
     turn_share,
     without_weak,
 )
-from rtmap_cli.steps.label.cloud.match import Match, Matcher, best_start, make_matcher
+from rtmap_cli.steps.label.cloud.match import best_start, make_matcher
+from rtmap_cli.steps.label.cloud.matcher import Match, Matcher
 from rtmap_cli.steps.label.cloud.place import starts
 from rtmap_cli.steps.label.cloud.points import Sweep, deskewed, leaf_of
 
