@@ -332,6 +332,11 @@ def test_of_stretches_that_overlap_the_first_one_is_made() -> None:
     assert [x.change_id for x in together(e, edits)] == ["0", "2"]
     assert [x.change_id for x in together(e, edits[::-1])] == ["3"]
     apply_edits(VectorMap([e], CRS), together(e, edits), "f")
+    # Also a short one near the start of a longer one.
+    short = _edit("5", "delete", e, e.points[0] + (e.points[-1] - e.points[0]) * [[0.11], [0.115]])
+    assert together(e, [edits[0], short]) == [edits[0]]
+    with pytest.raises(BadInput, match="overlap"):
+        apply_edits(VectorMap([e], CRS), [edits[0], short], "f")
 
 
 def test_two_stretches_of_one_line_and_a_clash() -> None:

@@ -102,9 +102,11 @@ class _Feet:
     ) -> None:
         unit = stations.strand
         feet = Feet(*candidate_feet(stations, samples, gate, unit))
-        named = own is not None and bool((own >= 0).any())
-        if own is not None and named:
+        total = np.bincount(samples.detection, samples.spacing)
+        self.score = np.ones(len(total))
+        if own is not None and (own >= 0).any():
             feet = _faithful(feet, stations, own)
+            self.score[samples.detection] = samples.score
         self.sample, self.station = feet.sample, feet.station
         self.offset, self.along = feet.offset, feet.along
         self.weight = samples.spacing[self.sample]
@@ -120,11 +122,7 @@ class _Feet:
         self.frame = samples.frame[self.sample]
         self.slot = self.frame * count + where[self.station]
         self.free = np.ones(len(self.sample), bool)
-        total = np.bincount(samples.detection, samples.spacing)
         self.least = np.minimum(MIN_STRETCH, 0.6 * total)
-        self.score = np.ones(len(total))
-        if named:
-            self.score[samples.detection] = samples.score
 
     def pick(self, index: Int) -> Feet:
         """Some of the feet."""

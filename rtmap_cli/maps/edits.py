@@ -117,7 +117,7 @@ def together(element: Element, edits: Sequence[Edit]) -> list[Edit]:
     line = _turned(element, edits) if is_ring(element.points) else element
     kept: list[_Cut] = []
     for cut in (_cut(line, edit) for edit in edits):
-        if all(cut.start >= k.stop - REST or k.start >= cut.stop - REST for k in kept):
+        if not any(_overlap(cut, k) for k in kept):
             kept.append(cut)
     return [cut.edit for cut in kept]
 
@@ -276,10 +276,16 @@ def _cuts(element: Element, edits: Sequence[Edit], where: str | Path) -> tuple[E
         line = _turned(element, edits)
     cuts = sorted((_cut(line, edit) for edit in edits), key=lambda c: (c.start, c.stop))
     for one, other in itertools.pairwise(cuts):
-        if other.start < one.stop - REST:
+        if _overlap(one, other):
             what = f"changes {one.edit.change_id} and {other.edit.change_id} overlap on"
             raise BadInput(where, f"{what} {element.element_id}", "accept one of them")
     return line, cuts
+
+
+def _overlap(one: _Cut, other: _Cut) -> bool:
+    """Whether two stretches have more in common than is left over at ends."""
+    first, second = sorted((one, other), key=lambda c: (c.start, c.stop))
+    return second.start < first.stop - REST
 
 
 def _turned(element: Element, edits: Sequence[Edit]) -> Element:

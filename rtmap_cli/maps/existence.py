@@ -20,7 +20,7 @@ easier to deceive where nothing is: such votes have rates of their own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,8 @@ PRIOR_LOG_ODDS = 2.5
 
 @dataclass(frozen=True)
 class Prompted:
-    """What of a ``VoteModel`` differs where the network was asked about an element of the map."""
+    """What of a ``VoteModel`` differs where the network was asked about an element of the map; the
+    parameters are those of that model."""
 
     found: float = 0.9
     strength: float = 8.0
@@ -71,7 +72,7 @@ class VoteModel:
     strength: float = 8.0
     false_strength: float = 4.0
     most_views: float = 24.0
-    prompted: Prompted = field(default_factory=lambda: Prompted())
+    prompted: Prompted = Prompted()
 
     @property
     def of_prompted(self) -> VoteModel:

@@ -31,19 +31,18 @@ Mask = NDArray[np.bool_]
 TOGETHER = 3
 """Feet of a detection that are so many stations apart, or nearer, cover those between them."""
 SEEN_SHARE = 0.3
-"""A drive has seen a place when it found something in this share of the usual rate, ..."""
+"""A drive has seen a place when it found something in this share of the usual rate …"""
 SEEN_PROMPTED = 0.6
-"""... or in this one where its network was asked about the place, and easier to deceive."""
+"""… or in this one where its network was asked about the place, and easier to deceive."""
 CONFIRMED = 0.35
 """A line found by this share of the frames that looked is there."""
 NOISE_SCORE = 0.1
 """A detection of this score or less says nothing …"""
 SURE_NO, SURE_YES = 0.15, 0.85
 """… nor does an existence up to the first; from the second on the network is sure."""
-
-
 GLANCE = 6.0
-"""Fewer views are of the border of the range, where answers are worse than usual."""
+"""A place with fewer views counts as not asked about: they are looks from the border of the range,
+where answers are worse than usual."""
 
 
 class Looks(Protocol):
