@@ -23,13 +23,15 @@ lint: $(call stamp,$(EXTRAS))
 	$(BIN)/lint-imports
 
 bench: $(call stamp,$(EXTRAS))
-	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script --help | head -3; done
+	@for file in benchmarks/*/[a-z]*.py; do grep -q __main__ $$file || continue; \
+	  name=$$(echo $${file%.py} | tr / .); \
+	  echo "== python -m $$name"; $(BIN)/python -m $$name --help | head -3; done
 
 bench-tables: $(call stamp,simulate)
-	$(BIN)/python benchmarks/paper_tables.py
+	$(BIN)/python -m benchmarks.paper.tables
 
 bench-fleet: $(call stamp,simulate)
-	$(BIN)/python benchmarks/fleet_tables.py $(if $(PARTS),--parts $(PARTS))
+	$(BIN)/python -m benchmarks.fleet.tables $(if $(PARTS),--parts $(PARTS))
 
 schemas: $(call stamp,$(EXTRAS))
 	$(BIN)/python schemas/generate.py

@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-from collections.abc import Iterator
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
-BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
-
-
-@pytest.fixture(scope="module")
-def bench() -> Iterator[ModuleType]:
-    sys.path.insert(0, str(BENCHMARKS))
-    yield importlib.import_module("change_drives")
-    sys.path.remove(str(BENCHMARKS))
+from benchmarks.changes import drives as bench
 
 
 def _answer(*rows: tuple[str, float | None]) -> dict[str, Any]:
@@ -26,7 +14,7 @@ def _answer(*rows: tuple[str, float | None]) -> dict[str, Any]:
     return {"rows": named, "km": 0.5, "changed": [8, 10], "unchanged": [30, 30]}
 
 
-def test_counts_operating_point_and_calibration(bench: ModuleType) -> None:
+def test_counts_operating_point_and_calibration() -> None:
     answers = [
         _answer(("found", 0.9), ("found", 0.4), ("false", 0.6), ("false", 0.1)),
         _answer(("found", 0.8), ("missed", None), ("false", 0.3)),
@@ -45,7 +33,7 @@ def test_counts_operating_point_and_calibration(bench: ModuleType) -> None:
     assert got["kinds"] == {"insert divider": {"found": 2, "missed": 2, "false": 1}}
 
 
-def test_false_alarms_are_counted_where_recall_is_reached(bench: ModuleType) -> None:
+def test_false_alarms_are_counted_where_recall_is_reached() -> None:
     answers = [_answer(("found", 0.9), ("found", 0.7), ("false", 0.8), ("false", 0.2))]
     got = bench.figures(answers)
     assert got["point"] == 0.7 and got["false_at_recall"] == 2.0
@@ -55,9 +43,7 @@ def test_false_alarms_are_counted_where_recall_is_reached(bench: ModuleType) -> 
     assert words["false alarms per km at recall 0.95 after one traversal"] == "FAIL"
 
 
-def test_without_data_it_says_what_is_missing(
-    bench: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_data_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RTMAP_DATA", raising=False)
     with pytest.raises(SystemExit, match="RTMAP_DATA"):
         bench.parse([])

@@ -454,7 +454,7 @@ def test_fleet_benchmark_runs(
 ) -> None:
     import runpy
 
-    script = Path(__file__).parents[1] / "benchmarks" / "fleet.py"
+    script = Path(__file__).parents[1] / "benchmarks" / "fleet" / "chain.py"
     words = f"frames --golden {rtmap_golden} --maps 7fab2350 --scenarios straight --drives 1"
     monkeypatch.setattr("sys.argv", [str(script), *words.split()])
     runpy.run_path(str(script), run_name="__main__")

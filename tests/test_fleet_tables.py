@@ -12,12 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from benchmarks.fleet import poses as fleet_print
+from benchmarks.fleet import tables as fleet_tables
 
-import fleet_print
-import fleet_tables
-
-SCRIPT = Path(fleet_tables.__file__)
 ONE = ["--maps", "adcf7d18", "--parts", "poses", "--jobs", "1", "--drives", "2"]
 
 
@@ -102,11 +99,11 @@ def test_other_options_are_another_measurement(golden: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("value", ["", "somewhere"])
-def test_without_the_benchmark_one_line_says_so(value: str, tmp_path: Path) -> None:
+def test_without_the_benchmark_one_line_says_so(value: str) -> None:
     result = subprocess.run(
-        [sys.executable, str(SCRIPT)],
+        [sys.executable, "-m", "benchmarks.fleet.tables"],
         env=os.environ | {"RTMAP_GOLDEN": value},
-        cwd=tmp_path,
+        cwd=Path(__file__).parents[1],
         capture_output=True,
         text=True,
     )

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 pytest.importorskip("small_gicp")
-BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
 @pytest.fixture(scope="module")
 def real() -> Any:
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        import label_cloud_real
+    from benchmarks.label import cloud_real
 
-        return label_cloud_real
-    finally:
-        sys.path.remove(str(BENCHMARKS))
+    return cloud_real
 
 
 def _need(folder: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +11,12 @@ import pytest
 torch = pytest.importorskip("torch", reason="torch is not installed (extra: train)")
 pytest.importorskip("cv2", reason="opencv is not installed (extra: train)")
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-import ablation_figures  # noqa: E402
-import paper_ablations  # noqa: E402
-import paper_tables  # noqa: E402
 from rtmap_models.config import PaperConfig, load_config  # noqa: E402
 from rtmap_models.training.validate import area_under_curve  # noqa: E402
 
+from benchmarks.paper import ablation_figures  # noqa: E402
+from benchmarks.paper import ablations as paper_ablations  # noqa: E402
+from benchmarks.paper import tables as paper_tables  # noqa: E402
 from rtmap_cli.steps.evaluate.maps.precision import Scorer  # noqa: E402
 
 SMALL = """

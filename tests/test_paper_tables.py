@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,10 @@ import numpy as np
 import pytest
 from fusion_scene import ORIGIN, drive, street
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-import paper_places
-import paper_print
-import paper_tables
-import paper_worlds
-
+from benchmarks.common import places as paper_places
+from benchmarks.common import worlds as paper_worlds
+from benchmarks.paper import printing as paper_print
+from benchmarks.paper import tables as paper_tables
 from rtmap_cli.logs.run import MATCHED, OUTDATED, read_run
 from rtmap_cli.steps.simulate.driving.routes import Lane
 from rtmap_cli.steps.simulate.worlds.changes import parse_spec
@@ -177,7 +173,7 @@ def test_other_cycles_are_another_measurement() -> None:
 def test_ablations_are_read_or_said_not_to_be_there() -> None:
     lines = paper_print.table_4(None, None)
     assert any("not run" in line and "T^E" in line for line in lines)
-    assert any("paper_ablations.py" in line for line in lines)
+    assert any("benchmarks.paper.ablations" in line for line in lines)
     pose = [[0.6, 0.1, 0.3], [1.2, 0.2, 0.6]]
     made = {"config": "c", "steps": 9, "encoder steps": 5, "batch": 4, "frames": 8}
     row = {"figures": {"mAP": 0.25}, "cpu_minutes": 3.0, "poses": {"start": pose}}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -237,11 +236,8 @@ def test_windows_turn_with_the_vehicle(yaw: float, x: float, y: float) -> None:
 def test_a_sweep_is_fused_in_the_time_that_a_vehicle_has() -> None:
     """Processor time of one core, so that a busy machine does not count; with a margin of two."""
     pytest.importorskip("cv2")
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-    try:
-        from semantic_speed import measure
-    finally:
-        sys.path.pop(0)
+    from benchmarks.semantic.speed import measure
+
     six, vlp16 = measure(rounds=3)
     assert six["ms"] < 50 and vlp16["ms"] + vlp16["window_ms"] < 50
     assert six["opencv_ratio"] > 2 and six["loop_ratio"] > 10

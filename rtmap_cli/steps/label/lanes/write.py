@@ -32,7 +32,7 @@ STEP_KMH = 10.0
 SHARE = 0.5
 """Share of the vertices that must have been seen as paint or curb for the way to be one."""
 SIGMA = (1.5, 0.06, 0.06)
-"""Metres across by KINDS: what benchmarks/label_lanes.py finds of what was assumed, and of what was
+"""Metres across by KINDS: what benchmarks/label/lanes.py finds of what was assumed, and of what was
 seen (90 % lie within 0.1 m)."""
 
 

@@ -115,7 +115,7 @@ PRESETS: dict[str, Preset] = {
         ),
     ),
 }
-"""``rtmap-*`` are calibrated by benchmarks/paper_presets.py to the MapTRv2 rows of Table 1."""
+"""``rtmap-*`` are calibrated by benchmarks/paper/presets.py to the MapTRv2 rows of Table 1."""
 
 
 def find_preset(name: str | Path) -> Preset:

@@ -1,0 +1,1 @@
+"""Measurements beside bars and peers: `python -m benchmarks.ROOM.NAME --help`."""

@@ -1,0 +1,1 @@
+"""Change detection against changes that are known."""

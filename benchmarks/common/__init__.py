@@ -1,0 +1,1 @@
+"""What several rooms share: places, worlds, verdicts, tables in Markdown."""

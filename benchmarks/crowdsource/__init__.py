@@ -1,0 +1,1 @@
+"""Fused maps: honesty of their sigmas, speed, growth."""

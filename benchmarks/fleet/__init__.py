@@ -1,0 +1,1 @@
+"""The fleet benchmark of RTMAP_GOLDEN with its bars."""

@@ -1,0 +1,1 @@
+"""Clouds, lifting and lanes: accuracy against references, speed against peers."""

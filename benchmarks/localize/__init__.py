@@ -1,0 +1,1 @@
+"""Localization: bounds, robustness, speed."""

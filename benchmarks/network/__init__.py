@@ -1,0 +1,1 @@
+"""The networks: model card, latency, training recipes."""

@@ -1,0 +1,1 @@
+"""The tables of the RTMap paper, measured."""

@@ -1,0 +1,1 @@
+"""The semantic pipeline: fine-tuning and speed."""

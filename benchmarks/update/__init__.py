@@ -1,0 +1,1 @@
+"""The semi-automatic update, and the grid map that it starts from."""
