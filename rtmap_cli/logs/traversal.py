@@ -103,6 +103,14 @@ class Traversal:
         codes = np.array([row.get(name, -1) for name in said], np.int64)
         return np.repeat(codes, 2 * self.points.shape[1] - 1)
 
+    def windows(self, frame: Int) -> Array:
+        """(n, 4, 2) counter-clockwise corners of the range of frames (n,) in the map frame."""
+        x0, y0, x1, y1 = self.range_m
+        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+        pose = self.pose[frame]
+        c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
+        return _turned(np.tile(corners, (len(frame), 1, 1)), c, s) + pose[:, None, :2]
+
     def moved(self, pose: Array, pose_covariance: Array) -> Traversal:
         """The drive at other poses (m, 3) with other covariances (m, 3, 3), and what it saw."""
         turn = wrap_angle(pose[:, 2] - self.pose[:, 2])

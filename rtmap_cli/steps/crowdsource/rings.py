@@ -11,6 +11,7 @@ from rtmap_cli.geometry.rings import align, close, open_ring, open_rings, simpli
 from rtmap_cli.logs.traversal import Traversal, pose_variance
 from rtmap_cli.maps.consensus import Sightings, consensus
 from rtmap_cli.maps.refit import FusionModel
+from rtmap_cli.steps.crowdsource.cut_rings import cut_offsets
 from rtmap_cli.steps.crowdsource.lines import LONGEST_MOVE, Fused, columns, planar
 
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ def fuse_ring(
     the outline has at its place, by Eq. 5 with its own covariance.
     """
     reference = open_ring(points)
-    drives = [_sightings(t, _near(t, class_name, reference), reference) for t in traversals]
+    drives = [_sightings(t, class_name, reference) for t in traversals]
     moves, variances = consensus([d for d in drives if len(d)], 1, model)
     if not np.isfinite(variances[0]):
         return Fused(points, covariance, False)
@@ -65,10 +66,23 @@ def _smooth(offset: Array, reference: Array) -> Array:
     return out
 
 
-def _sightings(traversal: Traversal, index: Int, reference: Array) -> Sightings:
-    """Detections ``index`` of one element as offsets of its outline, point by point; the whole
-    outline is one station."""
-    rings = align(open_rings(traversal.points[index]), reference)
+def _sightings(traversal: Traversal, class_name: str, reference: Array) -> Sightings:
+    """Detections of one element as offsets of its outline, point by point; the whole outline is
+    one station. Those that the range cuts tell what was in view."""
+    near, reach = _near(traversal, class_name, reference)
+    rings = open_rings(traversal.points[near])
+    share = np.maximum(_outline(rings), 1e-3) / _outline(reference[None])
+    whole = np.hypot(*(rings.mean(axis=1) - reference.mean(axis=0)).T) <= reach
+    whole &= ~traversal.cut[near] | (np.abs(np.log(share)) <= WHOLE)
+    offset = np.zeros((len(near), *reference.shape))
+    offset[whole] = align(rings[whole], reference) - reference
+    cover = whole.astype(np.float64)
+    cut = np.flatnonzero(traversal.cut[near] & ~whole)
+    windows = traversal.windows(traversal.frame[near[cut]])
+    some, offset_cut, in_view = cut_offsets(rings[cut], windows, reference, reach[cut])
+    offset[cut[some]], cover[cut[some]] = offset_cut, in_view
+    kept = np.flatnonzero(cover > 0)
+    index, offset = near[kept], offset[kept]
     frame = traversal.frame[index]
     cov = traversal.covariance[index]
     variance = (cov[..., 0, 0] + cov[..., 1, 1]).mean(axis=1) / 2
@@ -77,17 +91,17 @@ def _sightings(traversal: Traversal, index: Int, reference: Array) -> Sightings:
     return Sightings(
         np.zeros(len(index), np.int64),
         traversal.way[frame],
-        (rings - reference).reshape(len(index), 2 * len(reference)),
+        offset.reshape(len(index), 2 * len(reference)),
         np.sqrt(np.maximum(variance, 0.01)),
-        np.ones(len(index)),
+        cover[kept],
         traversal.score[index],
         (axes[0] + axes[1]) / 2,
     )
 
 
-def _near(traversal: Traversal, class_name: str, reference: Array) -> Int:
-    """Detections of the class whose centre lies at the element's; of those that the range cuts
-    the ones that hold most of the element."""
+def _near(traversal: Traversal, class_name: str, reference: Array) -> tuple[Int, Array]:
+    """Detections of the class that may be the element, and how far (m) the middle of each may lie
+    from the element's."""
     mine = np.flatnonzero(traversal.class_name == class_name)
     centre = reference.mean(axis=0)
     cov = traversal.covariance[mine]
@@ -96,13 +110,9 @@ def _near(traversal: Traversal, class_name: str, reference: Array) -> Int:
     # Nearly all are elsewhere: their outlines need not be drawn to see that.
     points = traversal.points[mine]
     size = np.ptp(points, axis=1).max(axis=1, initial=0.0)
-    close_by = np.hypot(*(points.mean(axis=1) - centre).T) <= reach + size
-    mine, reach = mine[close_by], reach[close_by]
-    rings = open_rings(traversal.points[mine])
-    near = np.hypot(*(rings.mean(axis=1) - centre).T) <= reach
-    share = np.maximum(_outline(rings), 1e-3) / _outline(reference[None])
-    near &= ~traversal.cut[mine] | (np.abs(np.log(share)) <= WHOLE)
-    return mine[near]
+    own = np.where(traversal.cut[mine], np.ptp(reference, axis=0).max(), 0.0)
+    near = np.hypot(*(points.mean(axis=1) - centre).T) <= reach + np.maximum(size, own)
+    return mine[near], reach[near]
 
 
 def _outline(rings: Array) -> Array:

@@ -89,18 +89,8 @@ def class_rings(traversal: Traversal, class_name: str) -> Rings:
         traversal.frame[index],
         traversal.cut[index],
         features(points) if len(index) else np.zeros((0, 4)),
-        _windows(traversal, traversal.frame[index]),
+        traversal.windows(traversal.frame[index]),
     )
-
-
-def _windows(traversal: Traversal, frame: Int) -> Array:
-    """(n, 4, 2) corners of the range of some frames in the map frame."""
-    x0, y0, x1, y1 = traversal.range_m
-    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-    pose = traversal.pose[frame]
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=-2)
-    return np.einsum("nij,kj->nki", turn, corners) + pose[:, None, :2]
 
 
 def _near(variance: Array) -> Array:
