@@ -32,6 +32,7 @@ from rtmap_cli.maps.existence import (
 from rtmap_cli.maps.registration import registered
 from rtmap_cli.maps.sight import SightModel
 from rtmap_cli.maps.stations import GATE, MIN_COS, Samples, Stations, stations_of
+from rtmap_cli.steps.detect_changes.bridges import bridged
 from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, ring_counts
 from rtmap_cli.steps.detect_changes.doubles import split_doubles
 from rtmap_cli.steps.detect_changes.gaps import part_at_gaps
@@ -126,7 +127,8 @@ def _lines(
             break
         # What is left of the candidates competes once more, without those that were refuted.
         found = _supported(found, len(old), stations, votes, policy)
-        found = part_at_gaps(joined_lines(found, name), old, samples)
+        found = bridged(joined_lines(found, name), old, samples)
+        found = part_at_gaps(found, old, samples)
     out = [_line_evidence(e, k, stations, votes, settings, now_ns) for k, e in enumerate(prior)]
     # Where a line of the map lies is told by what was seen, not by what the map made of it.
     _add_offsets(out, stations, traversals, seen, fresh, settings)
