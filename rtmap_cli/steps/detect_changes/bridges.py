@@ -52,10 +52,9 @@ class _Runs:
 
 @dataclass(frozen=True)
 class _Link:
-    """One detection that runs from an end to another: the drive and its ``score``, where (m) it
-    leaves the lines, and its ``way`` (n, 2) between the two."""
+    """One detection that runs from an end to another: its ``score``, where (m) it leaves the one
+    line and reaches the other, and its ``way`` (n, 2) between the two."""
 
-    drive: int
     score: float
     leave: float
     reach: float
@@ -71,16 +70,13 @@ def bridged(lines: list[Array], others: list[Array], samples: Sequence[Samples])
     total = np.bincount(stations.line, stations.spacing).astype(np.float64)
     links: Links = defaultdict(list)
     runs = [_runs(stations, s) for s in samples]
-    for drive, (r, s) in enumerate(zip(runs, samples, strict=True)):
-        _find_links(links, drive, r, s, total, len(others))
-    drives = int(sum(len(r.line) > 0 for r in runs))
+    for r, s in zip(runs, samples, strict=True):
+        _find_links(links, r, s, total, len(others))
     found = []
     for (a, b), some in links.items():
         weight = sum(x.score for x in some)
         apart = float(sum(_apart(r, a, b, total) for r in runs))
-        if len({x.drive for x in some}) < min(2, drives) or weight < LEAST:
-            continue
-        if weight >= APART * apart:
+        if weight >= LEAST and weight >= APART * apart:
             found.append((-weight, a, b))
     taken: set[int] = set()
     chosen = {}
@@ -114,9 +110,7 @@ def _runs(stations: Stations, samples: Samples) -> _Runs:
     )  # fmt: skip
 
 
-def _find_links(
-    links: Links, drive: int, runs: _Runs, samples: Samples, total: Array, old: int
-) -> None:
+def _find_links(links: Links, runs: _Runs, samples: Samples, total: Array, old: int) -> None:
     """Add the links of a drive under the ends that they join: 2 · line, + 1 for the far end."""
     size = np.abs(runs.end - runs.begin)
     long = np.flatnonzero((size >= SHORTEST) & (runs.line >= old))
@@ -136,9 +130,9 @@ def _find_links(
         one, two = 2 * a + int(far), 2 * b + int(near)
         score = float(runs.score[i])
         if one < two:
-            links[one, two].append(_Link(drive, score, leave, reach, way))
+            links[one, two].append(_Link(score, leave, reach, way))
         else:
-            links[two, one].append(_Link(drive, score, reach, leave, way[::-1]))
+            links[two, one].append(_Link(score, reach, leave, way[::-1]))
 
 
 def _apart(runs: _Runs, a: int, b: int, total: Array) -> float:
