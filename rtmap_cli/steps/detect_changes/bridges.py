@@ -81,7 +81,7 @@ def bridged(lines: list[Array], others: list[Array], samples: Sequence[Samples])
     taken: set[int] = set()
     chosen = {}
     for _, a, b in sorted(found):
-        if a not in taken and b not in taken and a // 2 != b // 2:
+        if a not in taken and b not in taken:
             taken |= {a, b}
             chosen[a, b] = links[a, b]
     return _joined(lines, stations, len(others), chosen)
@@ -100,7 +100,8 @@ def _runs(stations: Stations, samples: Samples) -> _Runs:
     other[1:] = (frame[1:] != frame[:-1]) | (score[1:] != score[:-1])
     other[1:] |= np.diff(samples.detection[sample]) > 1
     new = other.copy()
-    new[1:] |= line[1:] != line[:-1]
+    # From the one end of a line to its other one there is a jump, too: it is closed.
+    new[1:] |= (line[1:] != line[:-1]) | (np.abs(np.diff(s)) > TO_END)
     start = np.flatnonzero(new)
     stop = np.append(start[1:], len(sample)) - 1 if len(start) else start
     whole = np.cumsum(other)[start]
@@ -115,7 +116,7 @@ def _find_links(links: Links, runs: _Runs, samples: Samples, total: Array, old: 
     size = np.abs(runs.end - runs.begin)
     long = np.flatnonzero((size >= SHORTEST) & (runs.line >= old))
     for i, j in zip(long[:-1].tolist(), long[1:].tolist(), strict=True):
-        if runs.whole[i] != runs.whole[j] or runs.line[i] == runs.line[j]:
+        if runs.whole[i] != runs.whole[j]:
             continue
         a, b = int(runs.line[i]), int(runs.line[j])
         far, near = runs.end[i] > runs.begin[i], runs.end[j] < runs.begin[j]
@@ -128,6 +129,8 @@ def _find_links(links: Links, runs: _Runs, samples: Samples, total: Array, old: 
         if length(way) > LONGEST:
             continue
         one, two = 2 * a + int(far), 2 * b + int(near)
+        if one == two:
+            continue
         score = float(runs.score[i])
         if one < two:
             links[one, two].append(_Link(score, leave, reach, way))
@@ -193,7 +196,8 @@ def _joined(
             if here ^ 1 not in after:
                 break
             here, way = after[here ^ 1]
-            if here // 2 not in done:
-                chain.append(way[1:-1])
+            chain.append(way[1:-1])
+            if here == start:
+                chain.append(chain[0][:1])
         out.append(np.concatenate(chain))
     return out
