@@ -24,6 +24,8 @@ SMOOTH = 1.5
 NEAR, REACH, FARTHEST = 3.5, 2.2, 8.0
 """A detection whose centre is farther (m) from the element's is not averaged, unless that is
 within so many of its sigmas and this distance (m)."""
+ROUNDS = 3
+"""Times that a new element is averaged."""
 WHOLE = 0.25
 """Log of how much longer or shorter the outline of a detection at the border may be."""
 
@@ -41,12 +43,15 @@ def fuse_ring(
     The vertices of a prior outline keep their number and order: each moves by the offset that
     the outline has at its place, by Eq. 5 with its own covariance.
     """
-    reference = open_ring(points)
-    drives = [_sightings(t, class_name, reference) for t in traversals]
-    moves, variances = consensus([d for d in drives if len(d)], 1, model)
-    if not np.isfinite(variances[0]):
-        return Fused(points, covariance, False)
-    outline = reference + _smooth(moves[0].reshape(-1, 2), reference)
+    reference = outline = open_ring(points)
+    # Which detections are the element's, and what of them, is told anew where a new one has moved.
+    for _ in range(ROUNDS if new else 1):
+        reference = outline
+        drives = [_sightings(t, class_name, reference) for t in traversals]
+        moves, variances = consensus([d for d in drives if len(d)], 1, model)
+        if not np.isfinite(variances[0]):
+            return Fused(points, covariance, False)
+        outline = reference + _smooth(moves[0].reshape(-1, 2), reference)
     variance = np.full(len(reference), variances[0] + model.common)
     if new:
         ring = simplified(outline, SIMPLIFY)
