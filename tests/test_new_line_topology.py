@@ -1,0 +1,95 @@
+"""Where new lines begin, end and go on is told by the pieces in which detections come."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from fusion_scene import CRS, ORIGIN, drive, line
+from numpy.typing import NDArray
+
+from rtmap_cli.geometry.polylines import is_ring
+from rtmap_cli.geometry.rings import close, open_ring
+from rtmap_cli.logs.run import write_run
+from rtmap_cli.maps.element import Element, VectorMap
+from rtmap_cli.maps.store import read_map
+from rtmap_cli.steps.crowdsource.cut_rings import cut_offsets
+
+Array = NDArray[np.float64]
+
+
+def mapped(world: VectorMap, rtmap: Any, folder: Path, noise: float = 0.35) -> list[Element]:
+    """The elements of a first map from four drives, relative to the origin."""
+    for k in range(4):
+        write_run(drive(world, f"d{k}", seed=k, noise=noise), folder / "runs" / f"d{k}")
+    rtmap("crowdsource", folder / "runs", "--map", folder / "map")
+    offset = [*ORIGIN, 0.0]
+    return [e.with_points(e.points - offset, e.covariance) for e in read_map(folder / "map")]
+
+
+def boundary(name: str, *corners: tuple[float, float]) -> Element:
+    return Element(name, "boundary", ORIGIN + np.array(corners))
+
+
+def test_a_gap_that_every_frame_shows_stays_open(rtmap: Any, tmp_path: Path) -> None:
+    kerb = line("kerb", "boundary", 7.0)
+    parts = line("west", "divider", 1.5, x1=50.0), line("east", "divider", 1.5, x0=55.0)
+    found = mapped(VectorMap([kerb, *parts], CRS), rtmap, tmp_path)
+    dividers = sorted((e.xy for e in found if e.class_name == "divider"), key=lambda p: p[0, 0])
+    assert len(dividers) == 2
+    assert dividers[0][:, 0].max() == pytest.approx(50.0, abs=1.2)
+    assert dividers[1][:, 0].min() == pytest.approx(55.0, abs=1.2)
+
+
+def test_a_line_in_one_piece_has_no_gap(rtmap: Any, tmp_path: Path) -> None:
+    lines = line("kerb", "boundary", 7.0), line("paint", "divider", 1.5)
+    found = mapped(VectorMap(lines, CRS), rtmap, tmp_path)
+    assert [e.class_name for e in found].count("divider") == 1
+
+
+def test_a_boundary_goes_on_through_a_niche(rtmap: Any, tmp_path: Path) -> None:
+    corners = [(-20.0, 6.0), (48.0, 6.0), (48.0, 11.0), (53.0, 11.0), (53.0, 6.0), (120.0, 6.0)]
+    world = VectorMap([boundary("kerb", *corners), line("far", "boundary", -7.0)], CRS)
+    found = mapped(world, rtmap, tmp_path)
+    north = [e.xy for e in found if e.class_name == "boundary" and e.xy[:, 1].mean() > 0]
+    assert len(north) == 1
+    truth = shapely.LineString(corners)
+    away = shapely.distance(shapely.points(north[0]), truth)
+    assert np.quantile(away, 0.9) < 0.6 and north[0][:, 1].max() > 10.0
+
+
+def test_an_island_that_detections_run_around_is_closed(rtmap: Any, tmp_path: Path) -> None:
+    ring = [
+        (40.0, 2.0),
+        (58.0, 2.0),
+        (59.0, 3.2),
+        (58.0, 4.4),
+        (40.0, 4.4),
+        (39.0, 3.2),
+        (40.0, 2.0),
+    ]
+    world = VectorMap([boundary("island", *ring), line("far", "boundary", -7.0)], CRS)
+    found = mapped(world, rtmap, tmp_path, noise=0.2)
+    islands = [e for e in found if e.xy[:, 1].mean() > 0]
+    assert len(islands) == 1 and is_ring(islands[0].points)
+    area = shapely.Polygon(islands[0].xy).area
+    assert area == pytest.approx(shapely.Polygon(ring).area, rel=0.15)
+
+
+@pytest.mark.parametrize("move", [(0.8, -0.5), (-0.6, 1.2), (0.0, 0.0)])
+def test_a_crossing_that_the_range_cuts_tells_where_it_lies(move: tuple[float, float]) -> None:
+    corners = np.array([(0.0, 0.0), (4.0, 0.0), (4.0, 12.0), (0.0, 12.0)])
+    reference = open_ring(close(corners))
+    window = np.array([(-30.0, -20.0), (30.0, -20.0), (30.0, 8.0), (-30.0, 8.0)])
+    seen = shapely.Polygon(corners + move).intersection(shapely.Polygon(window))
+    ring = open_ring(np.asarray(seen.exterior.coords))
+    rows, offset, share = cut_offsets(ring[None], window[None], reference, np.array([4.0]))
+    assert rows.tolist() == [0] and 0.35 < share[0] < 0.9
+    assert np.abs(offset[0].mean(axis=0) - move).max() < 0.15
+    # What stands elsewhere is not this one, and what is hardly in view says nothing.
+    assert not len(cut_offsets(ring[None] + 9.0, window[None], reference, np.array([4.0]))[0])
+    low = window - [0.0, 7.0]
+    assert not len(cut_offsets(ring[None], low[None], reference, np.array([4.0]))[0])
