@@ -24,8 +24,8 @@ SMOOTH = 1.5
 NEAR, REACH, FARTHEST = 3.5, 2.2, 8.0
 """A detection whose centre is farther (m) from the element's is not averaged, unless that is
 within so many of its sigmas and this distance (m)."""
-ROUNDS = 3
-"""Times that a new element is averaged."""
+ROUNDS, STAYS = 3, 0.2
+"""Times that a new element is averaged, unless it moves by less (m)."""
 WHOLE = 0.25
 """Log of how much longer or shorter the outline of a detection at the border may be."""
 
@@ -52,6 +52,8 @@ def fuse_ring(
         if not np.isfinite(variances[0]):
             return Fused(points, covariance, False)
         outline = reference + _smooth(moves[0].reshape(-1, 2), reference)
+        if np.hypot(*(outline - reference).mean(axis=0)) < STAYS:
+            break
     variance = np.full(len(reference), variances[0] + model.common)
     if new:
         ring = simplified(outline, SIMPLIFY)
