@@ -134,14 +134,17 @@ def count(
     ok = np.isin(key, view_key)
     views_ = np.bincount(seen.point, weight, n).astype(np.float64)
     looked = PairLooks(seen.point, seen.frame)
-    prompted = _prompted(n, np.intersect1d(asked, view_key), views_)
+    prompted = _prompted(n, asked, view_key, views_)
     return _counted(n, looked, views_, prompted, key[ok], value[ok], score[ok])
 
 
-def _prompted(n: int, asked: Int, views_: Array) -> Mask:
-    """(n,) places at which at least half of the views have a question ``asked``, and that were not
-    only glanced at."""
-    return (views_ >= GLANCE) & (2 * np.bincount(asked % n, minlength=n) >= views_)
+def _prompted(n: int, asked: Int, viewed: Int, views_: Array) -> Mask:
+    """(n,) places at which at least half of the views have a question, and that were not only
+    glanced at; ``asked``, ``viewed``: frame · n + place of the questions and of what was seen."""
+    if not len(asked):
+        return np.zeros(n, bool)
+    both = np.intersect1d(asked, viewed)
+    return (views_ >= GLANCE) & (2 * np.bincount(both % n, minlength=n) >= views_)
 
 
 def _best_hits(key: Int, value: Array, score: Array) -> tuple[Int, Array, Array]:
@@ -224,7 +227,7 @@ def line_counts(
     at, place = np.divmod(key, n)
     ok = outlook.sees_in_turn(at, cell[place], margin)
     looked = CellLooks(outlook, cell, margin)
-    prompted = _prompted(n, np.intersect1d(key[ok], asked_key), views_)
+    prompted = _prompted(n, asked_key, key[ok], views_)
     return _counted(n, looked, views_, prompted, key[ok], value[ok], score[ok])
 
 
