@@ -47,7 +47,7 @@ def fuse_ring(
     # Which detections are the element's, and what of them, is told anew where a new one has moved.
     for _ in range(ROUNDS if new else 1):
         reference = outline
-        drives = [_sightings(t, class_name, reference) for t in traversals]
+        drives = [_sightings(t, class_name, reference, new) for t in traversals]
         moves, variances = consensus([d for d in drives if len(d)], 1, model)
         if not np.isfinite(variances[0]):
             return Fused(points, covariance, False)
@@ -73,9 +73,10 @@ def _smooth(offset: Array, reference: Array) -> Array:
     return out
 
 
-def _sightings(traversal: Traversal, class_name: str, reference: Array) -> Sightings:
+def _sightings(traversal: Traversal, class_name: str, reference: Array, new: bool) -> Sightings:
     """Detections of one element as offsets of its outline, point by point; the whole outline is
-    one station. Those that the range cuts tell what was in view."""
+    one station. Of a ``new`` one those that the range cuts tell what was in view; an answer about
+    the map is cut where the frame was thought to stand when the network was asked."""
     near, reach = _near(traversal, class_name, reference)
     rings = open_rings(traversal.points[near])
     share = np.maximum(_outline(rings), 1e-3) / _outline(reference[None])
@@ -84,7 +85,7 @@ def _sightings(traversal: Traversal, class_name: str, reference: Array) -> Sight
     offset = np.zeros((len(near), *reference.shape))
     offset[whole] = align(rings[whole], reference) - reference
     cover = whole.astype(np.float64)
-    cut = np.flatnonzero(traversal.cut[near] & ~whole)
+    cut = np.flatnonzero(traversal.cut[near] & ~whole & new)
     windows = traversal.windows(traversal.frame[near[cut]])
     some, offset_cut, in_view = cut_offsets(rings[cut], windows, reference, reach[cut])
     offset[cut[some]], cover[cut[some]] = offset_cut, in_view
