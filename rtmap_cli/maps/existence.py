@@ -150,6 +150,27 @@ def joint_log_likelihoods(
     return out
 
 
+def remembered(seen: Array, in_view: Array, drives: Array, model: VoteModel) -> Array:
+    """(3, n) log-likelihoods to be added to those of further drives: what ``drives`` (n,) that
+    are in the map already, which found a place in ``seen`` of ``in_view`` frames, say about how
+    hard it is to see. What they said about its existence is in its log-odds.
+
+    A mixture over the product of all drives needs their posterior share of hard places. It is not
+    below that of ``model``: an element that is easy to see as a whole may have parts that are not.
+    """
+    out = np.zeros((3, len(seen)))
+    some = (drives > 0) & (in_view > 0)
+    if not some.any():
+        return out
+    n = drives[some]
+    easy, hard, _ = n * drive_log_likelihoods(seen[some] / n, in_view[some] / n, model)
+    odds = np.clip(np.log(model.hard) - np.log1p(-model.hard) + hard - easy, None, LIMIT)
+    share = np.maximum(probability(odds), model.hard)
+    out[0, some] = np.log1p(-share) - np.log1p(-model.hard)
+    out[1, some] = np.log(share) - np.log(model.hard)
+    return out
+
+
 def log_odds_of(votes: Array, model: VoteModel) -> Array:
     """Log-likelihood ratio exists : absent of summed (3, ...) log-likelihoods of many drives.
 

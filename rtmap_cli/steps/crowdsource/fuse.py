@@ -154,7 +154,11 @@ def _deletable(element: Element, stretch: Stretch, policy: Policy) -> bool:
     looked = element.traversals + stretch.counts.traversals_in_view
     unlikely = float(probability(stretch.log_odds)) < policy.delete_below
     found, of = stretch.counts.newest(policy.delete_of)
-    missed = of - found >= min(policy.delete_traversals, of)
+    # Of drives fused before, the map knows how many there were and which found it, not their order.
+    room = policy.delete_of - of if policy.delete_of else element.traversals
+    before = min(element.traversals, room)
+    missed_before = min(max(element.traversals - len(element.runs), 0), before)
+    missed = of - found + missed_before >= min(policy.delete_traversals, of + before)
     return unlikely and looked >= policy.delete_traversals and missed
 
 
@@ -270,13 +274,14 @@ def _fused_lines(
     new = [p.new for p in pieces]
     points = [p.element.points.copy() for p in pieces]
     covariances = [p.element.covariance for p in pieces]
-    fused = fuse_lines(points, covariances, new, name, fresh, every, model)
+    looked_at = [p.seen for p in pieces]
+    fused = fuse_lines(points, covariances, new, name, fresh, every, model, looked_at)
     moved = [f.points.copy() for f in fused]
     snap_ends(moved, new, SNAP, SNAP_ANGLE)
     elements = []
     model_sha = _model_of(every)
     for piece, f, xyz in zip(pieces, fused, moved, strict=True):
-        if not f.touched or not piece.seen:
+        if not f.touched:
             elements.append(piece.element)
             continue
         covariance = f.covariance

@@ -67,12 +67,14 @@ def fuse_lines(
     fresh: Sequence[Traversal],
     every: Sequence[Traversal],
     model: FusionModel,
+    looked_at: Sequence[bool] | None = None,
 ) -> list[Fused]:
     """Eq. 5 for the lines of one class, all at once.
 
     Prior lines are moved by the ``fresh`` traversals (what the map was already fused from does not
     count again), ``new`` ones by ``every`` traversal. Vertices shared by two pieces of a chain
-    get the same displacement, so that the pieces stay joined.
+    get the same displacement, so that the pieces stay joined. What was not ``looked_at`` stays,
+    and holds the vertices that it shares.
     """
     if not points:
         return []
@@ -103,6 +105,8 @@ def fuse_lines(
     size = np.hypot(move[:, 0], move[:, 1])
     move *= np.minimum(1.0, LONGEST_MOVE / np.maximum(size, 1e-9))[:, None]
     seen = [bool(np.isfinite(variance[stations.of_line(k)]).any()) for k in range(len(points))]
+    if looked_at is not None:
+        seen = [s and looked for s, looked in zip(seen, looked_at, strict=True)]
     move = _at_nodes(vertices, move, np.repeat(seen, np.diff(start)))
     out = []
     for k, p in enumerate(points):

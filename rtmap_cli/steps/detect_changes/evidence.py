@@ -121,7 +121,7 @@ def _lines(
             return []
         ids = [e.element_id for e in prior] + [""] * len(found)
         votes = _line_votes(
-            stations, ids, len(old), traversals, samples, owns, sigma, sight, fresh, settings
+            stations, ids, prior, traversals, samples, owns, sigma, sight, fresh, settings
         )
         if last:
             break
@@ -143,7 +143,7 @@ def _lines(
 def _line_votes(
     stations: Stations,
     ids: Sequence[str],
-    old: int,
+    prior: Sequence[Element],
     traversals: Sequence[Traversal],
     samples: Sequence[Samples],
     owns: Sequence[NDArray[np.int64]],
@@ -152,14 +152,16 @@ def _line_votes(
     fresh: NDArray[np.bool_],
     settings: Settings,
 ) -> Ballot:
-    """The votes on all stations, the first ``old`` lines being those of the prior; ``sigma`` of
+    """The votes on all stations, the first lines being those of the ``prior``; ``sigma`` of
     every drive's samples as ``offset_sigma`` has it, ``owns`` as for ``all_line_counts``."""
+    old = len(prior)
     before = int(np.searchsorted(stations.line, old))
     margin = settings.policy.view_margin_m
     drives = stations, ids, traversals, samples, owns, margin, sight
     # Lines that are all new part best by what is nearest; known ones may be seen farther off.
     full = all_line_counts(*drives, wide=old > 0)
-    votes = ballot(full.counts, traversals, settings.votes, fresh, before, APART)
+    history = _history(prior)[:, stations.line[:before]]
+    votes = ballot(full.counts, traversals, settings.votes, fresh, before, APART, history)
     picked = np.arange(len(stations)) >= before
     pairs = neighbours(stations)
     doubtful = questioned(votes, pairs, before)
@@ -180,6 +182,12 @@ def _line_votes(
                 settings.policy.new_log_odds,
             )
     return votes
+
+
+def _history(prior: Sequence[Element]) -> Array:
+    """(3, n) of elements of the map: frames that found them, had them in view, and drives."""
+    rows = [(e.seen, e.in_view, e.traversals) for e in prior]
+    return np.array(rows, float).reshape(-1, 3).T
 
 
 def _add_offsets(
@@ -370,7 +378,8 @@ def _rings(
     elements = list(prior) + [Element(new_id(name, r), name, close(r)) for r in found]
     ids = [e.element_id for e in elements]
     counts, owners = ring_counts(places, ids, traversals, drives)
-    votes = ballot(counts, traversals, settings.votes, fresh, len(prior))
+    history = _history(prior)
+    votes = ballot(counts, traversals, settings.votes, fresh, len(prior), history=history)
     if len(found) and len(old):
         alone = ring_counts(places, ids, traversals, drives, first=len(old))
         votes = weighed_rings(votes, (counts, owners), alone, drives, places, len(old))

@@ -105,7 +105,7 @@ def weighed(
     (``picked``) before the votes.
     """
     extra = votes.extra.copy()
-    with_, alone = (_total(p.counts, votes.model, picked) for p in (full, without))
+    with_, alone = (_total(p.counts, votes, picked) for p in (full, without))
     extra[asked] += (with_[2] - alone[2])[asked]
     # No line explains less because it may take more: it could leave the rest alone.
     lost = np.minimum(_marginal(with_, votes.model) - _marginal(alone, votes.model), 0.0)
@@ -176,11 +176,11 @@ def _around(feet: Feet, stations: Stations, reach: int = 4) -> tuple[Array, Mask
     return total[0] / np.maximum(total[1], 1), total[1] >= reach
 
 
-def _total(drives: Sequence[DriveCounts], model: VoteModel, picked: Mask) -> Array:
-    """(3, n) log-likelihoods over some drives."""
+def _total(drives: Sequence[DriveCounts], votes: Ballot, picked: Mask) -> Array:
+    """(3, n) log-likelihoods over some drives, and of what is known from before."""
     names = ("hits", "views", "prompted")
     hits, views, prompted = (np.stack([getattr(d, name) for d in drives]) for name in names)
-    return joint_log_likelihoods(hits, views, model, picked, prompted)
+    return joint_log_likelihoods(hits, views, votes.model, picked, prompted) + votes.memory
 
 
 def _marginal(votes: Array, model: VoteModel) -> Array:
@@ -217,7 +217,7 @@ def weighed_rings(
     the map chose first."""
     picked = np.arange(len(places)) >= old
     extra = votes.extra.copy()
-    with_, alone = (_total(p[0], votes.model, picked) for p in (full, without))
+    with_, alone = (_total(p[0], votes, picked) for p in (full, without))
     extra[picked] += (with_[2] - alone[2])[picked]
     lost = np.minimum(_marginal(with_, votes.model) - _marginal(alone, votes.model), 0.0)
     centre = places.mean(axis=1)

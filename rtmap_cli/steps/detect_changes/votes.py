@@ -18,6 +18,7 @@ from rtmap_cli.maps.existence import (
     fitted,
     joint_log_likelihoods,
     log_odds_of,
+    remembered,
 )
 from rtmap_cli.maps.outlook import Outlook
 from rtmap_cli.maps.sight import Look, SightModel, measured_sight
@@ -282,8 +283,8 @@ def _asked_stations(
 class Ballot:
     """The drives' counts at n places, put together: ``votes`` (drives, 3, n) log-likelihoods,
     ``joint`` (3, n) those of all drives, ``in_view`` and ``seen`` (drives, n) flags, and the model
-    that judged them; ``extra`` (n,) log-likelihood that other places lose when these do not
-    exist."""
+    that judged them; ``memory`` (3, n) the part of ``joint`` that is of drives before these;
+    ``extra`` (n,) log-likelihood that other places lose when these do not exist."""
 
     votes: Array
     joint: Array
@@ -293,6 +294,7 @@ class Ballot:
     times: Sequence[Int]
     runs: tuple[str, ...]
     model: VoteModel
+    memory: Array
     extra: Array
 
     @property
@@ -391,11 +393,14 @@ def ballot(
     fresh: Mask | None = None,
     old: int = 0,
     every: int = 1,
+    history: Array | None = None,
 ) -> Ballot:
     """Put the drives together; the rates are measured on every ``every``-th place of the prior.
 
     The first ``old`` places are those of the prior, the others were picked by what was found. At
-    the former only ``fresh`` drives vote: what the others said is in the prior already.
+    the former only ``fresh`` drives vote: what the others said is in the prior already. Of it
+    ``history`` (3, old) tells how easily they saw the place: frames that found it, frames that had
+    it in view, drives.
     """
     if fresh is not None and not fresh.all():
         drives = [d if f else _without(d, old) for d, f in zip(drives, fresh, strict=True)]
@@ -410,15 +415,19 @@ def ballot(
         for h, v, p in zip(hits, looked, prompted, strict=True)
     ]
     enough = np.where(prompted, SEEN_PROMPTED * model.prompted.found, SEEN_SHARE * model.found)
+    memory = np.zeros((3, hits.shape[1]))
+    if history is not None:
+        memory[:, :old] = remembered(*history, model)
     return Ballot(
         np.stack(votes),
-        joint_log_likelihoods(hits, looked, model, picked, prompted),
+        joint_log_likelihoods(hits, looked, model, picked, prompted) + memory,
         looked >= 1.0,
         (looked > 0) & (hits >= enough * looked),
         drives,
         [t.timestamp_ns for t in traversals],
         tuple(t.run_id for t in traversals),
         model,
+        memory,
         np.zeros(hits.shape[1]),
     )
 
