@@ -97,11 +97,13 @@ def compared(before: VectorMap, after: VectorMap, waiting: Sequence[str] = ()) -
 
 @dataclass
 class _Piece:
-    """An element of the next version before its geometry is fused."""
+    """An element of the next version before its geometry is fused; ``before``: that it was fused
+    for a version before this one, too."""
 
     element: Element
     new: bool
     seen: bool
+    before: bool = False
 
 
 class _Charted:
@@ -143,7 +145,7 @@ def _pieces(
     whole = len(kept) == 1 and not gone
     if whole:
         odds = before + evidence.likelihood_ratio
-        return [_Piece(_updated(element, odds, evidence.counts), False, True)]
+        return [_Piece(_updated(element, odds, evidence.counts), False, True, element.traversals > 0)]
     out.split.append(element.element_id)
     return _split(element, kept, before)
 
@@ -173,7 +175,8 @@ def _split(element: Element, kept: list[Stretch], before: float) -> list[_Piece]
         geometry, covariance = _part(element, stretch)
         piece = replace(element, element_id=name, points=geometry, covariance=covariance)
         odds = before + stretch.likelihood_ratio
-        out[k] = _Piece(_updated(piece, odds, stretch.counts), False, True)
+        fused_before = element.traversals > 0
+        out[k] = _Piece(_updated(piece, odds, stretch.counts), False, True, fused_before)
     return [out[k] for k in sorted(out)]
 
 
@@ -275,7 +278,8 @@ def _fused_lines(
     points = [p.element.points.copy() for p in pieces]
     covariances = [p.element.covariance for p in pieces]
     looked_at = [p.seen for p in pieces]
-    fused = fuse_lines(points, covariances, new, name, fresh, every, model, looked_at)
+    before = [p.before for p in pieces]
+    fused = fuse_lines(points, covariances, new, name, fresh, every, model, looked_at, before)
     moved = [f.points.copy() for f in fused]
     snap_ends(moved, new, SNAP, SNAP_ANGLE)
     elements = []

@@ -68,13 +68,15 @@ def fuse_lines(
     every: Sequence[Traversal],
     model: FusionModel,
     looked_at: Sequence[bool] | None = None,
+    fused: Sequence[bool] | None = None,
 ) -> list[Fused]:
     """Eq. 5 for the lines of one class, all at once.
 
     Prior lines are moved by the ``fresh`` traversals (what the map was already fused from does not
     count again), ``new`` ones by ``every`` traversal. Vertices shared by two pieces of a chain
     get the same displacement, so that the pieces stay joined. What was not ``looked_at`` stays,
-    and holds the vertices that it shares.
+    and holds the vertices that it shares. Covariances of lines that were ``fused`` before have the
+    floor of ``model`` in them.
     """
     if not points:
         return []
@@ -98,6 +100,9 @@ def fuse_lines(
             for p, c, fresh_line in zip(points, covariances, new, strict=True)
         ]
     )
+    if fused is not None:
+        again = np.repeat(fused, np.diff(start))
+        before[again] = _without_floor(before[again], model.floor)
     chain = np.concatenate(
         [np.full(len(p), stations.chain[stations.of_line(k)[0]]) for k, p in enumerate(points)]
     )
@@ -123,6 +128,15 @@ def fuse_lines(
         heights = covariances[k]
         out.append(Fused(np.column_stack([xy, p[:, 2]]), columns(cov, heights), True))
     return out
+
+
+def _without_floor(covariance: Array, floor: float) -> Array:
+    """Covariances (n, 2, 2) without what was added to them so that no sigma is below ``floor``:
+    versions would lose half of what they know with every fusion. At most half of a variance goes,
+    so that a map of many versions can still learn."""
+    size, axes = np.linalg.eigh(covariance)
+    size = np.maximum(size - floor**2, size / 2)
+    return np.asarray((axes * size[:, None, :]) @ np.swapaxes(axes, -1, -2))
 
 
 def _at_nodes(vertices: Array, move: Array, seen: NDArray[np.bool_]) -> Array:
