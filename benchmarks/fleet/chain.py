@@ -163,7 +163,8 @@ def fusion(scenario: Scenario, options: argparse.Namespace) -> dict[str, Any]:
 
 def fusion_rows(scenario: Scenario, options: argparse.Namespace) -> dict[str, Any]:
     """The rows of the benchmark over cycles, with U and without: the first n drives at once, into a
-    new map (``first`` at their initial poses, ``localized`` on the prior) or the prior itself."""
+    new map (``first`` at their initial poses, ``localized`` on the prior) or the prior itself; and
+    ``nightly`` one drive after the other, each localized on the version before it."""
     scenario.import_prior()
     rows: dict[str, Any] = {}
     for row in ("first", "localized", "maintenance"):
@@ -189,6 +190,8 @@ def fusion_rows(scenario: Scenario, options: argparse.Namespace) -> dict[str, An
                 scenario.command("crowdsource", some, "--map", target, *more, *options.crowdsource)
                 scores[str(n)] = judge_map(scenario, read_map(target), n)
             rows[row + (", without U" if more else "")] = scores
+    fused = fused_maps(scenario, options)
+    rows["nightly"] = {str(n): judge_map(scenario, night, n) for n, night in fused}
     return rows
 
 

@@ -16,6 +16,7 @@ ROWS = {
     "first": "first mapping: no prior, initial poses only",
     "localized": "localized on the prior, fused without it",
     "maintenance": "prior and runs fused, changes applied",
+    "nightly": "the same, one drive a night on the version before",
 }
 GRID = {
     "first": {
@@ -35,6 +36,7 @@ BARS = {
     "localized": {3: ((84.0, 63.0), (76.0, 51.0)), 10: ((88.0, 70.0), (81.0, 58.0))},
     "maintenance": {3: ((94.0, 91.0), (93.0, 90.0)), 10: ((96.0, 93.0), (95.0, 92.0))},
 }
+BARS["nightly"] = BARS["maintenance"]
 FALL = 0.5
 """Points by which a class may fall from one cycle to the next."""
 CHANGE_BARS = {1: 0.75, 3: 0.95}
@@ -63,6 +65,10 @@ def _cycles(figures: Figures, row: str) -> list[str]:
     return list(next(iter(figures.values()))[row])
 
 
+def _has(figures: Figures, row: str) -> bool:
+    return row in next(iter(figures.values()))
+
+
 def _pair(figures: Figures, kind: str, *keys: str) -> str:
     """mAP, strict in brackets."""
     loose = _mean(figures, kind, *keys, "frames", "mAP")
@@ -80,8 +86,10 @@ def fusion_tables(figures: Figures) -> list[str]:
                 " · ".join(f"{a:g} ({b:g})" for a, b in table[int(n)]) if int(n) in table else ""
                 for table in (GRID.get(row, {}), BARS[row])
             ]
-            cells = [" · ".join(_pair(figures, k, r, n) for k in kinds)
-                     for r in (row, f"{row}, without U")]  # fmt: skip
+            cells = [
+                " · ".join(_pair(figures, k, r, n) for k in kinds) if _has(figures, r) else "–"
+                for r in (row, f"{row}, without U")
+            ]
             whole = [_mean(figures, k, row, n, "cells", "mAP") for k in kinds]
             inside = [_mean(figures, k, row, n, "sigma", "inside_90") for k in kinds]
             lines.append(
@@ -115,7 +123,9 @@ def fusion_verdicts(figures: Figures) -> list[Verdict]:
                     text = f"{row}, cycle {n}, {kind}: mAP" + (" strict" if "_" in key else "")
                     value = round(_mean(figures, kind, row, n, key, "mAP"), 2)
                     out.append(Verdict(text, value, bar, 100.0))
-            out += [*_rises(figures, row, kind), _sigma_helps(figures, row, kind)]
+            out += _rises(figures, row, kind)
+            if _has(figures, f"{row}, without U"):
+                out.append(_sigma_helps(figures, row, kind))
             share = np.mean(
                 [_mean(figures, kind, row, n, "sigma", "inside_90") / 100 for n in cycles]
             )

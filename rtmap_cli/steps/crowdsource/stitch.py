@@ -83,8 +83,9 @@ def _free(name: str, taken: set[str]) -> str:
 
 def _weld(prior: VectorMap, outcomes: list[Outcome]) -> None:
     """Ends of prior lines that met and belong to different regions meet again, in place: at the
-    mean of where the regions put them."""
+    mean of where the regions put them, or where one of them stays."""
     region = {name: k for k, o in enumerate(outcomes) for name in o.old}
+    still = {name for o in outcomes for name in o.told["untouched"]}
     ends: dict[tuple[int, int], list[tuple[str, int]]] = {}
     for e in prior:
         if e.element_id in region and not is_ring(e.points):
@@ -98,8 +99,12 @@ def _weld(prior: VectorMap, outcomes: list[Outcome]) -> None:
         # What was split or deleted has no such end any more.
         if any(len(p) != 1 or p[0].element_id != g[0] for p, g in zip(parts, group, strict=True)):
             continue
-        middle = np.mean([p[0].xy[at] for p, (_, at) in zip(parts, group, strict=True)], axis=0)
-        for part, (_, at) in zip(parts, group, strict=True):
+        places = [p[0].xy[at] for p, (_, at) in zip(parts, group, strict=True)]
+        held = [at for at, (name, _) in zip(places, group, strict=True) if name in still]
+        middle = held[0] if held else np.mean(places, axis=0)
+        for part, (name, at) in zip(parts, group, strict=True):
+            if name in still:
+                continue
             points = part[0].points.copy()
             points[at, :2] = middle
             part[0] = part[0].with_points(points, part[0].covariance)
