@@ -145,7 +145,9 @@ def _pieces(
     whole = len(kept) == 1 and not gone
     if whole:
         odds = before + evidence.likelihood_ratio
-        return [_Piece(_updated(element, odds, evidence.counts), False, True, element.traversals > 0)]
+        return [
+            _Piece(_updated(element, odds, evidence.counts), False, True, element.traversals > 0)
+        ]
     out.split.append(element.element_id)
     return _split(element, kept, before)
 

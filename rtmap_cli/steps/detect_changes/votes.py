@@ -417,7 +417,7 @@ def ballot(
     enough = np.where(prompted, SEEN_PROMPTED * model.prompted.found, SEEN_SHARE * model.found)
     memory = np.zeros((3, hits.shape[1]))
     if history is not None:
-        memory[:, :old] = remembered(*history, model)
+        memory[:, :old] = remembered(history[0], history[1], history[2], model)
     return Ballot(
         np.stack(votes),
         joint_log_likelihoods(hits, looked, model, picked, prompted) + memory,
