@@ -165,11 +165,22 @@ def _lines_apart(lines: list[Element], others: list[Element]) -> list[Element]:
         return lines
     shapes = np.array([shapely.LineString(e.xy) for e in others], object)
     tree = shapely.STRtree(shapes)
-    ends = np.array([e.points[at] for e in others if not is_ring(e.points) for at in (0, -1)])
+    ends = [e.points[at] for e in others if not is_ring(e.points) for at in (0, -1)]
+    common = [_in_common(e, others, shapes, tree) for e in lines]
+    pieces: list[Array] = []
+    owner: list[int] = []
+    cuts: list[tuple[int, int]] = []
+    for k, (e, same) in enumerate(zip(lines, common, strict=True)):
+        for piece, *cut in _left_over(e, same) if same.any() else []:
+            cuts += [(len(pieces), at) for at, here in zip((0, -1), cut, strict=True) if here]
+            pieces.append(piece)
+            owner.append(k)
+    for (k, at), end in _own_ends(cuts, pieces, np.array(ends)):
+        pieces[k] = _put_onto(pieces[k], end) if at == 0 else _put_onto(pieces[k][::-1], end)[::-1]
     out = []
-    for e in lines:
-        same = _in_common(e, others, shapes, tree)
-        out += _left_over(e, same, ends) if same.any() else [e]
+    for k, (e, same) in enumerate(zip(lines, common, strict=True)):
+        mine = [p for p, o in zip(pieces, owner, strict=True) if o == k and length(p) >= GAP]
+        out += parts_of(e, mine) if same.any() else [e]
     return out
 
 
@@ -206,8 +217,11 @@ def _in_common(
     return same
 
 
-def _left_over(element: Element, same: NDArray[np.bool_], ends: Array) -> list[Element]:
-    """The stretches that are not in common; where one was cut it begins at the nearest end."""
+def _left_over(
+    element: Element, same: NDArray[np.bool_]
+) -> list[tuple[Array, bool, bool]]:
+    """The stretches (n, 3 or 7) that are not in common, and whether each was cut at its start and
+    at its end."""
     table = with_covariance(element)
     at = arc_length(table)
     places = np.linspace(0.0, at[-1], len(same))
@@ -221,28 +235,43 @@ def _left_over(element: Element, same: NDArray[np.bool_], ends: Array) -> list[E
             np.array([np.interp(x, at, table[:, k]) for k in range(table.shape[1])]) for x in (a, b)
         )
         piece = np.concatenate([first[None], table[inside], last[None]])
-        if run[0] > 0:
-            piece = _put_onto(piece, ends)
-        if run[-1] < len(same) - 1:
-            piece = _put_onto(piece[::-1], ends)[::-1]
-        if length(piece) >= GAP:
-            pieces.append(piece)
-    return parts_of(element, pieces)
+        pieces.append((piece, bool(run[0] > 0), bool(run[-1] < len(same) - 1)))
+    return pieces
 
 
-def _put_onto(piece: Array, ends: Array) -> Array:
-    """The piece beginning exactly at the end that is nearest to its start, if one is near."""
-    if not len(ends):
-        return piece
-    far = np.hypot(*(ends[:, :2] - piece[0, :2]).T)
-    k = int(far.argmin())
-    if far[k] > GAP:
-        return piece
+def _own_ends(
+    cuts: Sequence[tuple[int, int]], pieces: Sequence[Array], ends: Array
+) -> list[tuple[tuple[int, int], Array]]:
+    """Of every cut (piece, 0 or -1) the end (3,) that it is put onto, if one is near: each an end
+    of its own where there are as many, so that lines a foot apart keep their order."""
+    if not len(ends) or not cuts:
+        return []
+    from scipy.optimize import linear_sum_assignment
+
+    place = np.array([pieces[k][at, :2] for k, at in cuts])
+    beside = np.array([tangents(pieces[k][:, :2])[at] for k, at in cuts])[:, ::-1] * [-1.0, 1.0]
+    apart = ends[None, :, :2] - place[:, None]
+    far = np.hypot(apart[..., 0], apart[..., 1])
+    # Along the line a cut lies where stations happen to be: what counts is how far beside.
+    cost = (apart * beside[:, None]).sum(axis=-1) ** 2 + 0.01 * far**2
+    cost[far > GAP] = 1e6
+    own = dict(zip(*linear_sum_assignment(cost), strict=True))
+    out = []
+    for k, cut in enumerate(cuts):
+        j = own.get(k)
+        j = int(far[k].argmin()) if j is None or far[k, j] > GAP else j
+        if far[k, j] <= GAP:
+            out.append((cut, ends[j]))
+    return out
+
+
+def _put_onto(piece: Array, end: Array) -> Array:
+    """The piece beginning exactly at an end (3,)."""
     # Vertices that lie behind that end would make the line turn back.
-    step = piece[1:, :2] - ends[k, :2]
+    step = piece[1:, :2] - end[:2]
     onward = piece[-1, :2] - piece[0, :2]
     ahead = np.flatnonzero((step @ onward > 0) & (np.hypot(*step.T) > STEP))
     start = int(ahead[0]) + 1 if len(ahead) else len(piece) - 1
     head = piece[:1].copy()
-    head[0, :3] = ends[k]
+    head[0, :3] = end
     return np.concatenate([head, piece[start:]])
