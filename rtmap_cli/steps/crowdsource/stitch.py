@@ -267,11 +267,12 @@ def _own_ends(
 
 def _put_onto(piece: Array, end: Array) -> Array:
     """The piece beginning exactly at an end (3,)."""
+    along = arc_length(piece)
+    ahead = np.array([np.interp(2 * GAP, along, piece[:, k]) for k in (0, 1)]) - piece[0, :2]
     # Vertices that lie behind that end would make the line turn back.
     step = piece[1:, :2] - end[:2]
-    onward = piece[-1, :2] - piece[0, :2]
-    ahead = np.flatnonzero((step @ onward > 0) & (np.hypot(*step.T) > STEP))
-    start = int(ahead[0]) + 1 if len(ahead) else len(piece) - 1
+    onward = (step @ ahead > 0) & (np.hypot(*step.T) > STEP) | (along[1:] > 2 * GAP)
+    start = int(np.argmax(onward)) + 1 if onward.any() else len(piece) - 1
     head = piece[:1].copy()
     head[0, :3] = end
     return np.concatenate([head, piece[start:]])
