@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 from fusion_scene import CRS, ORIGIN, crossing, drive, line, save, shifted
 
 from rtmap_cli.logs.tracks import read_stretch, read_track
@@ -19,7 +20,7 @@ from rtmap_cli.maps.crop import joined
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import read_map, write_new_map
 from rtmap_cli.steps.crowdsource.engines import in_processes
-from rtmap_cli.steps.crowdsource.stitch import stitch
+from rtmap_cli.steps.crowdsource.stitch import _lines_apart, stitch
 from rtmap_cli.steps.crowdsource.tiling import plan
 
 Call = Callable[..., Any]
@@ -117,6 +118,51 @@ def test_lines_are_whole_over_the_borders_of_tiles(
         assert set(pairs) == set(one.by_id())
         far = [np.abs(pairs[e.element_id].xy - e.xy).max() for e in one]
         assert max(far) < 0.03
+
+
+def _island(x0: float, x1: float, y0: float, y1: float) -> Element:
+    """An island with a vertex every 5 m or so."""
+    x = np.linspace(x0, x1, 21)
+    there, back = (np.stack([x, np.full_like(x, y)], axis=-1) for y in (y0, y1))
+    return Element("island", "boundary", ORIGIN + np.concatenate([there, back[::-1], there[:1]]))
+
+
+def test_pairs_and_islands_are_whole_over_the_borders_of_tiles(rtmap: Call, tmp_path: Path) -> None:
+    """Two lines a foot apart stay two, an island over a border keeps both of its sides."""
+    pair = [line(f"y{y}", "divider", y, -20, 260) for y in (-5.0, -4.6)]
+    world = VectorMap([*pair, _island(60, 140, 1.0, 3.0)], CRS)
+    runs = _drives(tmp_path / "runs", world, range(3), noise=0.03)
+    for name, side in (("one", 512), ("many", 100)):
+        rtmap("crowdsource", runs, "--map", tmp_path / name, "--tile", side)
+        made = joined(read_map(tmp_path / name))
+        lines = [e.xy - ORIGIN for e in made if e.class_name == "divider"]
+        assert sorted(round(float(np.median(y)), 1) for _, y in (p.T for p in lines)) == [
+            -5.0,
+            -4.6,
+        ]
+        for p in lines:
+            assert np.ptp(p[:, 0]) > 255 and np.ptp(p[:, 1]) < 0.25
+        (island,) = [e.xy - ORIGIN for e in made if e.class_name == "boundary"]
+        assert np.array_equal(island[0], island[-1])
+        away = shapely.hausdorff_distance(
+            *(
+                shapely.segmentize(shapely.LineString(xy), 1.0)
+                for xy in (island, world.elements[-1].xy - ORIGIN)
+            )
+        )
+        assert away < 1.0
+
+
+def test_cut_lines_go_onto_ends_of_their_own() -> None:
+    """Two lines 0.4 m apart that lie 0.25 m beside those of the neighbour keep their order."""
+
+    def some(name: str, y: float, x0: float, x1: float) -> Element:
+        return line(name, "divider", y, x0, x1)
+
+    others = [some("a", 0.0, 0, 60), some("b", 0.4, 0, 60)]
+    mended = _lines_apart([some("c", 0.25, 50, 100), some("d", 0.65, 50, 100)], others)
+    starts = {e.element_id: tuple((e.xy[0] - ORIGIN).round(6)) for e in mended}
+    assert starts == {"c": (60.0, 0.0), "d": (60.0, 0.4)}
 
 
 def test_workers_change_no_byte(rtmap: Call, runs: Path, tmp_path: Path) -> None:

@@ -64,8 +64,8 @@ class _Link:
 def bridged(lines: list[Array], others: list[Array], samples: Sequence[Samples]) -> list[Array]:
     """The lines, those made one that detections run over; ``others`` are known and compete for
     detections."""
-    if len(lines) < 2:
-        return list(lines)
+    if not lines:
+        return []
     stations = stations_of([*others, *lines])
     total = np.bincount(stations.line, stations.spacing).astype(np.float64)
     links: Links = defaultdict(list)
