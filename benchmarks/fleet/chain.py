@@ -47,6 +47,17 @@ REAL = "real_change"
 RANGE = PROTOCOLS["rtmap"].range_m
 SIGMAS_90 = 1.6449
 """Half width of the 90 % interval of a Gaussian, in standard deviations."""
+WITHOUT_U = "--without-sigma"
+FUSIONS = {
+    "first": ("first",),
+    "first, without U": ("first", WITHOUT_U),
+    "localized": ("localized",),
+    "localized, without U": ("localized", WITHOUT_U),
+    "tiled": ("localized", "--tile", "100"),
+    "maintenance": ("maintenance",),
+    "maintenance, without U": ("maintenance", WITHOUT_U),
+}
+"""Rows that fuse the first n drives at once: what they are fused into, and options."""
 EVERY = 4
 """Fused maps are judged at every fourth frame, as the benchmark asks."""
 
@@ -163,33 +174,31 @@ def fusion(scenario: Scenario, options: argparse.Namespace) -> dict[str, Any]:
 
 def fusion_rows(scenario: Scenario, options: argparse.Namespace) -> dict[str, Any]:
     """The rows of the benchmark over cycles, with U and without: the first n drives at once, into a
-    new map (``first`` at their initial poses, ``localized`` on the prior) or the prior itself; and
-    ``nightly`` one drive after the other, each localized on the version before it."""
+    new map (``first`` at their initial poses, ``localized`` on the prior) or the prior itself;
+    ``tiled`` the localized row again in tiles of 100 m; ``nightly`` one drive after the other, each
+    localized on the version before it."""
     scenario.import_prior()
     rows: dict[str, Any] = {}
-    for row in ("first", "localized", "maintenance"):
+    for name, (row, *more) in FUSIONS.items():
         runs = scenario.work / ("raw" if row == "first" else "placed")
-        for more in ((), ("--without-sigma",)):
-            scores, target = {}, scenario.work / "map"
-            for n in range(1, max(options.cycles) + 1):
-                if not (runs / f"{n - 1:02d}").exists():
-                    run = scenario.import_run(n - 1, runs)
-                    if row != "first":
-                        scenario.command(
-                            "localize", run, "--map", scenario.prior, *options.localize
-                        )
-            for n in options.cycles:
-                some = scenario.work / "some"
-                shutil.rmtree(some, ignore_errors=True)
-                some.mkdir()
-                for k in range(n):
-                    (some / f"{k:02d}").symlink_to(runs / f"{k:02d}")
-                shutil.rmtree(target, ignore_errors=True)
-                if row == "maintenance":
-                    shutil.copytree(scenario.prior, target)
-                scenario.command("crowdsource", some, "--map", target, *more, *options.crowdsource)
-                scores[str(n)] = judge_map(scenario, read_map(target), n)
-            rows[row + (", without U" if more else "")] = scores
+        scores, target = {}, scenario.work / "map"
+        for n in range(1, max(options.cycles) + 1):
+            if not (runs / f"{n - 1:02d}").exists():
+                run = scenario.import_run(n - 1, runs)
+                if row != "first":
+                    scenario.command("localize", run, "--map", scenario.prior, *options.localize)
+        for n in options.cycles:
+            some = scenario.work / "some"
+            shutil.rmtree(some, ignore_errors=True)
+            some.mkdir()
+            for k in range(n):
+                (some / f"{k:02d}").symlink_to(runs / f"{k:02d}")
+            shutil.rmtree(target, ignore_errors=True)
+            if row == "maintenance":
+                shutil.copytree(scenario.prior, target)
+            scenario.command("crowdsource", some, "--map", target, *more, *options.crowdsource)
+            scores[str(n)] = judge_map(scenario, read_map(target), n)
+        rows[name] = scores
     fused = fused_maps(scenario, options)
     rows["nightly"] = {str(n): judge_map(scenario, night, n) for n, night in fused}
     return rows

@@ -15,6 +15,7 @@ from rtmap_cli.maps.element import CLASSES
 ROWS = {
     "first": "first mapping: no prior, initial poses only",
     "localized": "localized on the prior, fused without it",
+    "tiled": "the same in tiles of 100 m",
     "maintenance": "prior and runs fused, changes applied",
     "nightly": "the same, one drive a night on the version before",
 }
@@ -36,7 +37,7 @@ BARS = {
     "localized": {3: ((84.0, 63.0), (76.0, 51.0)), 10: ((88.0, 70.0), (81.0, 58.0))},
     "maintenance": {3: ((94.0, 91.0), (93.0, 90.0)), 10: ((96.0, 93.0), (95.0, 92.0))},
 }
-BARS["nightly"] = BARS["maintenance"]
+BARS |= {"tiled": BARS["localized"], "nightly": BARS["maintenance"]}
 FALL = 0.5
 """Points by which a class may fall from one cycle to the next."""
 CHANGE_BARS = {1: 0.75, 3: 0.95}

@@ -217,9 +217,7 @@ def _in_common(
     return same
 
 
-def _left_over(
-    element: Element, same: NDArray[np.bool_]
-) -> list[tuple[Array, bool, bool]]:
+def _left_over(element: Element, same: NDArray[np.bool_]) -> list[tuple[Array, bool, bool]]:
     """The stretches (n, 3 or 7) that are not in common, and whether each was cut at its start and
     at its end."""
     table = with_covariance(element)

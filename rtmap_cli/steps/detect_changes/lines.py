@@ -27,7 +27,7 @@ from rtmap_cli.steps.detect_changes.ridges import (
     trace,
 )
 from rtmap_cli.steps.detect_changes.rivals import Play
-from rtmap_cli.steps.detect_changes.votes import line_counts
+from rtmap_cli.steps.detect_changes.votes import line_counts, only_at_the_border
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -176,7 +176,8 @@ def all_line_counts(
     (stations,) these choose their detections before the others. ``wide`` as in ``assign_once``.
     """
     counts, feet = [], []
+    edge = only_at_the_border(stations, ids, traversals, margin)
     for traversal, s, own in zip(traversals, samples, owns, strict=True):
         feet.append(assign_once(stations, s, first, wide=wide, own=own)[0])
-        counts.append(line_counts(stations, ids, traversal, s, feet[-1], margin, sight))
+        counts.append(line_counts(stations, ids, traversal, s, feet[-1], margin, sight, edge))
     return Play(counts, feet)

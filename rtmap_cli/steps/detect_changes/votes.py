@@ -70,15 +70,22 @@ class PairLooks:
 @dataclass(frozen=True)
 class CellLooks:
     """Views by cells: the ``cell`` (n,) of each place in the drive's ``outlook``, and the
-    ``margin`` (m) of its range that does not count."""
+    ``margin`` (m) of its range that does not count but for the places of the ``edge`` (n,)."""
 
     outlook: Outlook
     cell: Int
     margin: float
+    edge: Mask
 
     def frames(self, index: Int) -> Int:
         """Of the places ``index`` the frames that could see them, once for each place."""
-        return self.outlook.frames(self.cell[index], self.margin)
+        edge = self.edge[index]
+        parts = [
+            self.outlook.frames(self.cell[index[some]], margin)
+            for some, margin in ((~edge, self.margin), (edge, 0.0))
+            if some.any()
+        ]
+        return np.concatenate(parts) if parts else np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -206,6 +213,20 @@ def sight_of(
     return measured_sight(Look(*np.concatenate(parts, axis=1)), np.concatenate(found))
 
 
+def only_at_the_border(
+    stations: Stations, ids: Sequence[str], traversals: Sequence[Traversal], margin: float
+) -> Mask:
+    """(n,) stations of new lines (without id) that no drive had in view inside the ``margin``."""
+    new = np.array([not name for name in ids], bool)
+    seen = np.zeros(len(ids), bool)
+    if new.any():
+        for traversal in traversals:
+            outlook = traversal.outlook
+            seen[stations.line[outlook.counted(margin)[outlook.cells(stations.xy)] > 0]] = True
+    out: Mask = (new & ~seen)[stations.line]
+    return out
+
+
 def line_counts(
     stations: Stations,
     ids: Sequence[str],
@@ -214,11 +235,16 @@ def line_counts(
     feet: Feet,
     margin: float,
     sight: SightModel,
+    edge: Mask,
 ) -> DriveCounts:
-    """Counts of one drive at the stations of lines with element ``ids`` (one per line)."""
+    """Counts of one drive at the stations of lines with element ``ids`` (one per line); at those of
+    the ``edge`` (n,) all of the range counts as looked at: else nothing could refute them."""
     n, outlook = len(stations), traversal.outlook
     cell = outlook.cells(stations.xy)
-    views_ = outlook.counted(margin, sight)[cell] * sight.curve("to_end", stations.to_end)
+    views_ = outlook.counted(margin, sight)[cell]
+    if edge.any():
+        views_[edge] = outlook.counted(0.0, sight)[cell[edge]]
+    views_ *= sight.curve("to_end", stations.to_end)
     key, score = _covered(stations, samples, feet)
     asked_key, existence = _asked_stations(stations, ids, traversal)
     value = np.concatenate([detection_value(score), answer_value(existence)])
@@ -227,7 +253,9 @@ def line_counts(
     )
     at, place = np.divmod(key, n)
     ok = outlook.sees_in_turn(at, cell[place], margin)
-    looked = CellLooks(outlook, cell, margin)
+    looked = CellLooks(outlook, cell, margin, edge)
+    if edge.any():
+        ok |= edge[place] & outlook.sees_in_turn(at, cell[place], 0.0)
     prompted = _prompted(n, asked_key, key[ok], views_)
     return _counted(n, looked, views_, prompted, key[ok], value[ok], score[ok])
 
