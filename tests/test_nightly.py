@@ -134,3 +134,22 @@ def test_versions_become_surer_as_one_batch_does(rtmap: Call, tmp_path: Path) ->
     assert 0.05 <= sigma["nightly"] < 1.25 * sigma["batch"]
     # If the newest night counted as much as all before it, it would be 0.044 m off.
     assert error["batch"] < 0.02 and error["nightly"] < 0.035
+
+
+def test_runs_that_are_missing_are_told(rtmap: Call, tmp_path: Path) -> None:
+    """A map from runs alone wants all of them; one with a prior those that saw what waits."""
+    world = street(line("new", "divider", -3.5, 20, 80))
+    write_new_map(street(), tmp_path / "map", "prior")
+    for k in range(4):
+        run = drive(world if k == 1 else street(), f"d{k}", seed=k)
+        save(run, tmp_path / "each" / f"{k}" / run.log_id)
+    said = []
+    for name in ("map", "alone"):
+        for k in range(3):
+            each = tmp_path / "each" / f"{k}"
+            said.append(rtmap("crowdsource", each, "--map", tmp_path / name).err)
+    told = [s.splitlines() for s in said]
+    assert told[0] == told[1] == told[3] == []
+    assert len(told[2]) == 1 and "1 new elements that wait" in told[2][0]
+    assert len(told[4]) == len(told[5]) == 1 and "2 runs that" in told[5][0]
+    assert "fused anew from all of them" in told[5][0] and "first: d0" in told[5][0]

@@ -108,6 +108,8 @@ def command(
     fresh = [t for t in tracks if t.run_id not in done]
     _tell_unlocalized([t.run_id for t in fresh if not t.localized], exists)
     _tell_mixed(fresh, before.version if before else None)
+    if fresh and not force:
+        _tell_missing(map_path, known - done)
     by_method = fuse_region_grid if method == "grid" else fuse_region
     compose = partial(by_method, policy=read_policy(policy_path) if policy_path else None)
     fusion, astray = None, {}
@@ -239,6 +241,26 @@ def _tell_mixed(fresh: list[Track], version: int | None) -> None:
             f"{ahead[0].map_version} of a map, this one has {version}: what they say about "
             "elements that it does not have is left out"
         )
+
+
+def _tell_missing(map_path: Path, missing: set[str]) -> None:
+    """What a map loses when runs that it was fused from do not lie in the folder any more."""
+    from rtmap_cli.maps.store import history
+    from rtmap_cli.output import log
+
+    if not missing:
+        return
+    what = f"{len(missing)} runs that {map_path} was fused from are not in RUNS_DIR"
+    what += f" (first: {min(missing)})"
+    versions = history(map_path)
+    waiting = versions[-1].info.get("crowdsource", {}).get("waiting", 0)
+    if all("crowdsource" in v.info for v in versions):
+        log(
+            f"warning: {what}: the map came from runs alone and is fused anew from all of them while "
+            "they lie there; without them its lines stay in the pieces that it has"
+        )
+    elif waiting:
+        log(f"{what}: {waiting} new elements that wait for another run lose their witnesses")
 
 
 def _described(result: dict[str, Any], fusion: Fusion) -> dict[str, Any]:
