@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from rtmap_cli.geometry.polylines import is_ring
 from rtmap_cli.geometry.rings import close, open_ring
 from rtmap_cli.logs.run import write_run
 from rtmap_cli.maps.element import Element, VectorMap
+from rtmap_cli.maps.existence import probability
 from rtmap_cli.maps.store import read_map
 from rtmap_cli.steps.crowdsource.cut_rings import cut_offsets
 
@@ -42,6 +44,27 @@ def test_a_gap_that_every_frame_shows_stays_open(rtmap: Any, tmp_path: Path) -> 
     assert len(dividers) == 2
     assert dividers[0][:, 0].max() == pytest.approx(50.0, abs=1.2)
     assert dividers[1][:, 0].min() == pytest.approx(55.0, abs=1.2)
+
+
+@pytest.mark.parametrize(("frames", "there"), [(None, True), (2, False)])
+def test_what_lies_at_the_border_of_the_range_is_judged(
+    rtmap: Any, tmp_path: Path, frames: int | None, there: bool
+) -> None:
+    """17 m beside the vehicle, a metre inside its range: seen by all frames, or by two of them."""
+    world = VectorMap([line("kerb", "boundary", 7.0), line("far", "boundary", 15.0)], CRS)
+    for k in range(2):
+        run = drive(world, f"d{k}", seed=k)
+        o = run.observations
+        far = np.flatnonzero(o.points[..., 1].mean(axis=1) > 14.0)
+        kept = far if frames is None else far[: frames * (k == 0)]
+        keep = np.isin(np.arange(len(o)), np.setdiff1d(far, kept), invert=True)
+        write_run(replace(run, observations=o.select(keep)), tmp_path / "runs" / f"d{k}")
+    rtmap("crowdsource", tmp_path / "runs", "--map", tmp_path / "map")
+    found = [e for e in read_map(tmp_path / "map") if e.xy[:, 1].mean() > ORIGIN[1] + 12]
+    if there:
+        assert [float(probability(e.existence)) > 0.9 for e in found] == [True]
+    else:
+        assert all(probability(e.existence) < 0.3 for e in found)
 
 
 def test_a_line_in_one_piece_has_no_gap(rtmap: Any, tmp_path: Path) -> None:

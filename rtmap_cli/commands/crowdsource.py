@@ -256,8 +256,8 @@ def _tell_missing(map_path: Path, missing: set[str]) -> None:
     waiting = versions[-1].info.get("crowdsource", {}).get("waiting", 0)
     if all("crowdsource" in v.info for v in versions):
         log(
-            f"warning: {what}: the map came from runs alone and is fused anew from all of them while "
-            "they lie there; without them its lines stay in the pieces that it has"
+            f"warning: {what}: a map from runs alone is fused anew from all of them while they lie "
+            "there; without them its lines stay in the pieces that it has"
         )
     elif waiting:
         log(f"{what}: {waiting} new elements that wait for another run lose their witnesses")
