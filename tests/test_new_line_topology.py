@@ -19,6 +19,7 @@ from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.existence import probability
 from rtmap_cli.maps.store import read_map
 from rtmap_cli.steps.crowdsource.cut_rings import cut_offsets
+from rtmap_cli.steps.detect_changes.bridges import _apart, _Runs, cut_beside
 
 Array = NDArray[np.float64]
 
@@ -71,6 +72,37 @@ def test_a_line_in_one_piece_has_no_gap(rtmap: Any, tmp_path: Path) -> None:
     lines = line("kerb", "boundary", 7.0), line("paint", "divider", 1.5)
     found = mapped(VectorMap(lines, CRS), rtmap, tmp_path)
     assert [e.class_name for e in found].count("divider") == 1
+
+
+def test_a_line_is_cut_where_the_end_of_another_lies_beside_it() -> None:
+    """Of the two sides of a wall either may be the one that goes on."""
+    x = np.linspace(0.0, 30.0, 31)
+    on = np.stack([x, np.zeros(31)], axis=-1)
+    side = np.stack([x[:11], np.full(11, 0.8)], axis=-1)
+    across = np.stack([np.full(9, 20.0), np.linspace(-4.0, 4.0, 9)], axis=-1)
+    west, east, *rest = cut_beside([on, side, across])
+    assert west[-1] == pytest.approx([10.0, 0.0], abs=0.6) and np.array_equal(west[-1], east[0])
+    assert west[0] == pytest.approx([0.0, 0.0]) and east[-1] == pytest.approx([30.0, 0.0])
+    assert [len(r) for r in rest] == [11, 9]
+    # Near its own end there is nothing to tell, nor where lines do not run alike.
+    assert len(cut_beside([on[:14], side])) == 2 and len(cut_beside([on, across])) == 2
+
+
+def test_pieces_that_the_range_makes_are_not_apart() -> None:
+    """Four frames have a line at either of two ends; the way between is in view of two of them."""
+    n = np.arange(8)
+    runs = _Runs(
+        line=n % 2, frame=n // 2, score=np.full(8, 0.5), whole=n, first=n, last=n,
+        begin=np.where(n % 2, 1.0, 10.0), end=np.where(n % 2, 9.0, 19.0),
+    )  # fmt: skip
+
+    class TwoFrames:
+        def clear(self, frame: Array, xy: Array, margin: float) -> Array:
+            return np.where(frame < 2, 5.0, -1.0) + 0 * xy[..., 0]
+
+    way = np.array([[0.0, 0.0], [3.0, 0.0]])
+    far, near = 1, 2
+    assert _apart(runs, far, near, np.full(2, 20.0), TwoFrames(), way) == pytest.approx(1.0)  # type: ignore[arg-type]
 
 
 def test_a_boundary_goes_on_through_a_niche(rtmap: Any, tmp_path: Path) -> None:

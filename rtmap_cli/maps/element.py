@@ -18,6 +18,9 @@ CLASSES = ("ped_crossing", "divider", "boundary")
 RING_CLASSES = frozenset({"ped_crossing"})
 """Classes whose elements are closed rings (polygons in files)."""
 
+OUTLINE_CLASSES = frozenset({"boundary"})
+"""Classes whose lines are outlines of areas: they never fork."""
+
 
 @dataclass(frozen=True)
 class Element:

@@ -12,8 +12,6 @@ from rtmap_cli.geometry.polylines import arc_length, is_ring, project
 
 Array = NDArray[np.float64]
 
-OUTLINES = ("boundary",)
-"""Classes whose lines are outlines of areas: they never fork."""
 BESIDE = 1.2
 """An end so near (m) to the inside of a line is a fork …"""
 AHEAD = 10.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import arc_length, is_ring, length
 from rtmap_cli.logs.traversal import Traversal
-from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
+from rtmap_cli.maps.element import OUTLINE_CLASSES, RING_CLASSES, Element, VectorMap
 from rtmap_cli.maps.evidence import (
     Counts,
     Evidence,
@@ -21,7 +21,7 @@ from rtmap_cli.maps.evidence import (
 )
 from rtmap_cli.maps.existence import LIMIT, probability
 from rtmap_cli.maps.refit import FusionModel
-from rtmap_cli.steps.crowdsource.forks import OUTLINES, Branch, forked
+from rtmap_cli.steps.crowdsource.forks import Branch, forked
 from rtmap_cli.steps.crowdsource.lines import fuse_lines, snap_ends
 from rtmap_cli.steps.crowdsource.rings import fuse_ring
 
@@ -262,7 +262,7 @@ def _geometry(
         group = [pieces[k] for k in index]
         fused = _fused_lines(group, name, fresh, every, model, out)
         parts = [[e] for e in fused]
-        if name not in OUTLINES:
+        if name not in OUTLINE_CLASSES:
             parts = _at_forks(fused, [p.new for p in group], out)
         done |= dict(zip(index, parts, strict=True))
     return [element for k in sorted(done) for element in done[k]]

@@ -8,6 +8,7 @@ to that of another say that the two belong together, and where the way between t
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,8 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.polylines import length, resample
-from rtmap_cli.maps.stations import Samples, Stations, assign, stations_of
+from rtmap_cli.geometry.polylines import is_ring, length, resample
+from rtmap_cli.logs.traversal import Traversal
+from rtmap_cli.maps.outlook import Outlook
+from rtmap_cli.maps.stations import MIN_COS, Samples, Stations, assign, stations_of
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -27,7 +30,11 @@ TO_END = 6.0
 LONGEST = 12.0
 """Longest way (m) between two lines."""
 SHORTEST = 4.0
-"""What a detection has of each of the two (m) at least."""
+"""What a detection has of each of the two (m) at least, or a quarter of a short one."""
+BESIDE, ALONGSIDE = 1.3, 4.0
+"""An end lies beside a line when its last metres (``ALONGSIDE``) are so near (m) to it."""
+MARGIN = 1.0
+"""Nearer (m) to the border of the range detections may be cut."""
 LEAST = 2.0
 """So many detections (weighted with their scores) must run over both, …"""
 APART = 1.0
@@ -61,7 +68,12 @@ class _Link:
     way: Array
 
 
-def bridged(lines: list[Array], others: list[Array], samples: Sequence[Samples]) -> list[Array]:
+def bridged(
+    lines: list[Array],
+    others: list[Array],
+    traversals: Sequence[Traversal],
+    samples: Sequence[Samples],
+) -> list[Array]:
     """The lines, those made one that detections run over; ``others`` are known and compete for
     detections."""
     if not lines:
@@ -75,7 +87,13 @@ def bridged(lines: list[Array], others: list[Array], samples: Sequence[Samples])
     found = []
     for (a, b), some in links.items():
         weight = sum(x.score for x in some)
-        apart = float(sum(_apart(r, a, b, total) for r in runs))
+        between = max(some, key=lambda x: x.score).way
+        apart = float(
+            sum(
+                _apart(r, a, b, total, t.outlook, between)
+                for r, t in zip(runs, traversals, strict=True)
+            )
+        )
         if weight >= LEAST and weight >= APART * apart:
             found.append((-weight, a, b))
     taken: set[int] = set()
@@ -114,7 +132,7 @@ def _runs(stations: Stations, samples: Samples) -> _Runs:
 def _find_links(links: Links, runs: _Runs, samples: Samples, total: Array, old: int) -> None:
     """Add the links of a drive under the ends that they join: 2 · line, + 1 for the far end."""
     size = np.abs(runs.end - runs.begin)
-    long = np.flatnonzero((size >= SHORTEST) & (runs.line >= old))
+    long = np.flatnonzero((size >= _enough(total)[runs.line]) & (runs.line >= old))
     for i, j in zip(long[:-1].tolist(), long[1:].tolist(), strict=True):
         if runs.whole[i] != runs.whole[j]:
             continue
@@ -138,20 +156,28 @@ def _find_links(links: Links, runs: _Runs, samples: Samples, total: Array, old: 
             links[two, one].append(_Link(score, reach, leave, way[::-1]))
 
 
-def _apart(runs: _Runs, a: int, b: int, total: Array) -> float:
-    """The frames (weighted with scores) with a detection at either of two ends, none over both."""
-    at = []
+def _enough(total: Array) -> Array:
+    """What a detection has of lines of the lengths ``total`` (n,), metres, at least."""
+    return np.minimum(SHORTEST, total / 4)
+
+
+def _apart(runs: _Runs, a: int, b: int, total: Array, outlook: Outlook, between: Array) -> float:
+    """The frames (weighted with scores) with a detection at either of two ends, none over both,
+    that had all of the way ``between`` them in view: else the range may have cut one in two."""
+    at, enough = [], _enough(total)
     for end in (a, b):
         low, high = np.minimum(runs.begin, runs.end), np.maximum(runs.begin, runs.end)
         near = total[end // 2] - high if end % 2 else low
-        mine = (runs.line == end // 2) & (near <= TO_END) & (high - low >= SHORTEST)
+        mine = (runs.line == end // 2) & (near <= TO_END) & (high - low >= enough[end // 2])
         at.append(np.flatnonzero(mine))
     whole = {int(runs.whole[k]) for k in at[0]} & {int(runs.whole[k]) for k in at[1]}
     together = {int(runs.frame[k]) for k in at[0] if int(runs.whole[k]) in whole}
     first = {int(runs.frame[k]): float(runs.score[k]) for k in at[0]}
     second = {int(runs.frame[k]): float(runs.score[k]) for k in at[1]}
     both = (first.keys() & second.keys()) - together
-    return sum(min(first[f], second[f]) for f in both)
+    frames = np.array(sorted(both), np.int64)
+    seen = (outlook.clear(frames[:, None], between[None], MARGIN) >= 0).all(axis=1)
+    return sum(min(first[f], second[f]) for f in frames[seen].tolist())
 
 
 def _joined(
@@ -201,3 +227,57 @@ def _joined(
                 chain.append(chain[0][:1])
         out.append(np.concatenate(chain))
     return out
+
+
+def cut_beside(lines: list[Array]) -> list[Array]:
+    """The lines cut where an end lies beside them, after having run beside them for a while.
+
+    Of two lines a foot apart, the sides of a thin wall, the ridge may go on as the wrong one. With
+    the cut, `bridged` can tell which of the two it is that goes on.
+    """
+    if not lines:
+        return []
+    stations = stations_of(lines)
+    cuts: dict[int, list[float]] = defaultdict(list)
+    for k, line in enumerate(lines):
+        if is_ring(line):
+            continue
+        own = stations.of_line(k)
+        for index in (own, own[::-1]):
+            behind = np.abs(stations.s[index] - stations.s[index[0]])
+            if behind[-1] < 2 * ALONGSIDE:
+                continue
+            other = _neighbour(stations, index[behind <= ALONGSIDE])
+            if other is not None:
+                cuts[int(stations.line[other])].append(float(stations.s[other]))
+    out = []
+    for k, line in enumerate(lines):
+        s, xy = stations.s[stations.of_line(k)], stations.xy[stations.of_line(k)]
+        # Near an end there is nothing to tell.
+        places = [c for c in sorted(cuts[k]) if ALONGSIDE < c < s[-1] - ALONGSIDE]
+        if not places or is_ring(line):
+            out.append(line)
+            continue
+        for low, high in itertools.pairwise([s[0], *places, s[-1]]):
+            at = np.concatenate([[low], s[(s > low) & (s < high)], [high]])
+            if high - low > SHORTEST:
+                out.append(np.stack([np.interp(at, s, xy[:, i]) for i in (0, 1)], axis=-1))
+    return out
+
+
+def _neighbour(stations: Stations, side: Int) -> int | None:
+    """The station beside the first of some in a row, of a line that runs beside all of them."""
+    near = stations.tree.query_ball_point(stations.xy[side], BESIDE)
+    strand, first = stations.strand, None
+    for i, some in zip(side.tolist(), near, strict=True):
+        others = [
+            j
+            for j in some
+            if strand[j] != strand[i]
+            and abs(float(stations.tangent[i] @ stations.tangent[j])) > MIN_COS
+        ]
+        if not others:
+            return None
+        if first is None:
+            first = min(others, key=lambda j: float(np.hypot(*(stations.xy[j] - stations.xy[i]))))
+    return first

@@ -14,7 +14,7 @@ from rtmap_cli.geometry.rings import RING_POINTS, close, open_ring
 from rtmap_cli.logs.offsets import fused_offsets
 from rtmap_cli.logs.traversal import Traversal
 from rtmap_cli.maps.assignment import assign_once, offset_sigma
-from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
+from rtmap_cli.maps.element import OUTLINE_CLASSES, RING_CLASSES, Element, VectorMap
 from rtmap_cli.maps.evidence import (
     Counts,
     Evidence,
@@ -32,7 +32,7 @@ from rtmap_cli.maps.existence import (
 from rtmap_cli.maps.registration import registered
 from rtmap_cli.maps.sight import SightModel
 from rtmap_cli.maps.stations import GATE, MIN_COS, Samples, Stations, stations_of
-from rtmap_cli.steps.detect_changes.bridges import bridged
+from rtmap_cli.steps.detect_changes.bridges import bridged, cut_beside
 from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, ring_counts
 from rtmap_cli.steps.detect_changes.doubles import split_doubles
 from rtmap_cli.steps.detect_changes.gaps import part_at_gaps
@@ -127,7 +127,10 @@ def _lines(
             break
         # What is left of the candidates competes once more, without those that were refuted.
         found = _supported(found, len(old), stations, votes, policy)
-        found = bridged(joined_lines(found, name), old, samples)
+        found = joined_lines(found, name)
+        if name in OUTLINE_CLASSES:
+            found = cut_beside(found)
+        found = joined_lines(bridged(found, old, traversals, samples), name)
         found = part_at_gaps(found, old, samples)
     out = [_line_evidence(e, k, stations, votes, settings, now_ns) for k, e in enumerate(prior)]
     # Where a line of the map lies is told by what was seen, not by what the map made of it.
