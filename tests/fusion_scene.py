@@ -11,18 +11,8 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import resample
 from rtmap_cli.geometry.poses import se3_from_xyyaw, transform
-from rtmap_cli.logs.run import (
-    MATCHED,
-    NEW,
-    OCCLUDERS,
-    OUTDATED,
-    Observations,
-    Poses,
-    Run,
-    RunFrames,
-    run_info,
-    write_run,
-)
+from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED, Observations, Poses, Run, RunFrames, run_info
+from rtmap_cli.logs.run_files import OCCLUDERS, write_run
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.visibility import hidden

@@ -13,16 +13,8 @@ import pytest
 from sample_logs import write_native_log
 
 from rtmap_cli.geometry.poses import se3_from_xyyaw
-from rtmap_cli.logs.run import (
-    MATCHED,
-    Observations,
-    Run,
-    RunFrames,
-    read_run,
-    run_info,
-    true_poses,
-    write_run,
-)
+from rtmap_cli.logs.run import MATCHED, Observations, Run, RunFrames, run_info, true_poses
+from rtmap_cli.logs.run_files import read_run, write_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import read_map, write_new_map
 

@@ -18,7 +18,8 @@ from rtmap_cli.formats.detections import (
     read_fleet_poses,
 )
 from rtmap_cli.geometry.poses import xyyaw_of
-from rtmap_cli.logs.run import NEW, read_run
+from rtmap_cli.logs.run import NEW
+from rtmap_cli.logs.run_files import read_run
 
 
 def drive() -> dict[str, Any]:

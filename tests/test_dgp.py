@@ -16,7 +16,7 @@ from rtmap_cli.errors import BadInput
 from rtmap_cli.formats.dgp import dgp_scenes
 from rtmap_cli.geometry.poses import quaternion_from_se3, se3_from_xyyaw
 from rtmap_cli.logs.open import open_log
-from rtmap_cli.logs.run import read_run
+from rtmap_cli.logs.run_files import read_run
 from rtmap_cli.maps.crs import is_local
 
 Call = Callable[..., Any]

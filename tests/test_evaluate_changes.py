@@ -12,7 +12,8 @@ import pytest
 import shapely
 
 from rtmap_cli.geometry.poses import se3_from_xyyaw
-from rtmap_cli.logs.run import true_poses, write_poses
+from rtmap_cli.logs.run import true_poses
+from rtmap_cli.logs.run_files import write_poses
 from rtmap_cli.maps.crs import to_lonlat
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
 from rtmap_cli.steps.evaluate.changes.elements import Change, same_place, score_changes

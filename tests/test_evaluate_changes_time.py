@@ -13,16 +13,8 @@ from sample_logs import write_av2_log, write_native_log
 
 from rtmap_cli.formats.changes import ChangeEvent, write_change_table
 from rtmap_cli.geometry.poses import se3_from_xyyaw
-from rtmap_cli.logs.run import (
-    OCCLUDERS,
-    Observations,
-    Run,
-    RunFrames,
-    run_info,
-    true_poses,
-    write_poses,
-    write_run,
-)
+from rtmap_cli.logs.run import Observations, Run, RunFrames, run_info, true_poses
+from rtmap_cli.logs.run_files import OCCLUDERS, write_poses, write_run
 from rtmap_cli.maps.crs import to_lonlat
 from rtmap_cli.maps.evidence import Counts
 from rtmap_cli.steps.evaluate.changes.elements import Change, score_changes

@@ -22,17 +22,8 @@ from rtmap_cli.geometry.chamfer import (
 )
 from rtmap_cli.geometry.polylines import resample
 from rtmap_cli.geometry.poses import se3_from_xyyaw
-from rtmap_cli.logs.run import (
-    MATCHED,
-    OUTDATED,
-    Observations,
-    Run,
-    RunFrames,
-    run_info,
-    true_poses,
-    write_poses,
-    write_run,
-)
+from rtmap_cli.logs.run import MATCHED, OUTDATED, Observations, Run, RunFrames, run_info, true_poses
+from rtmap_cli.logs.run_files import write_poses, write_run
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
 from rtmap_cli.steps.evaluate.drives import Drive

@@ -355,7 +355,8 @@ def test_logs_of_other_names_are_found_by_time_and_told(rtmap: Any, tmp_path: Pa
 
 def test_maps_of_other_crs_or_without_elements(rtmap: Any, tmp_path: Path) -> None:
     from rtmap_cli.geometry.poses import se3_from_xyyaw
-    from rtmap_cli.logs.run import true_poses, write_poses
+    from rtmap_cli.logs.run import true_poses
+    from rtmap_cli.logs.run_files import write_poses
 
     xy = np.column_stack([np.linspace(0, 60, 7) + 500_000, np.full(7, 5_000_000.0)])
     write_new_map(VectorMap([Element("a", "divider", xy)], "EPSG:32632"), tmp_path / "map", "test")

@@ -10,16 +10,8 @@ import numpy as np
 import pytest
 
 from rtmap_cli.geometry.poses import se3_from_xyyaw
-from rtmap_cli.logs.run import (
-    Observations,
-    Poses,
-    Run,
-    RunFrames,
-    run_info,
-    true_poses,
-    write_poses,
-    write_run,
-)
+from rtmap_cli.logs.run import Observations, Poses, Run, RunFrames, run_info, true_poses
+from rtmap_cli.logs.run_files import write_poses, write_run
 from rtmap_cli.steps.evaluate.poses import (
     PoseScore,
     chi_squares,

@@ -244,7 +244,8 @@ def test_junctions_of_towns(seed: int) -> None:
 @pytest.fixture
 def crossroads(tmp_path: Path) -> Path:
     """A folder with the map ``world`` of crossroads and the poses of a drive through it."""
-    from rtmap_cli.logs.run import true_poses, write_poses
+    from rtmap_cli.logs.run import true_poses
+    from rtmap_cli.logs.run_files import write_poses
 
     surface = rings(road([(-90, 0), (90, 0)], [(0, -90), (0, 90)]))
     write_new_map(VectorMap([*surface, divider("a", 0, -90, -8)], CRS), tmp_path / "world", "test")

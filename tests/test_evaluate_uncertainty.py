@@ -15,19 +15,8 @@ from scipy.stats import norm
 
 from rtmap_cli.geometry.polylines import resample
 from rtmap_cli.geometry.poses import se3_from_xyyaw, transform
-from rtmap_cli.logs.run import (
-    MATCHED,
-    Observations,
-    Poses,
-    Run,
-    RunFrames,
-    read_run,
-    run_info,
-    true_poses,
-    write_observations,
-    write_poses,
-    write_run,
-)
+from rtmap_cli.logs.run import MATCHED, Observations, Poses, Run, RunFrames, run_info, true_poses
+from rtmap_cli.logs.run_files import read_run, write_observations, write_poses, write_run
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map

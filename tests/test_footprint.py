@@ -13,14 +13,8 @@ from sample_logs import write_native_log
 from rtmap_cli.errors import BadInput
 from rtmap_cli.formats.model_file import find_model, read_model_metadata
 from rtmap_cli.geometry.poses import se3_from_xyyaw
-from rtmap_cli.logs.run import (
-    Observations,
-    Run,
-    RunFrames,
-    run_info,
-    true_poses,
-    write_run,
-)
+from rtmap_cli.logs.run import Observations, Run, RunFrames, run_info, true_poses
+from rtmap_cli.logs.run_files import write_run
 from rtmap_cli.maps.crs import local_crs, to_lonlat
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
 from rtmap_cli.maps.footprint import (

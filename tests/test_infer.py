@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from rtmap_cli.geometry.poses import se3_from_xyyaw, transform
 from rtmap_cli.logs.log import Camera, Frame, Occluder, Rig
 from rtmap_cli.logs.native import NativeLogWriter
-from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED, read_run
+from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED
+from rtmap_cli.logs.run_files import read_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
 from rtmap_cli.steps.infer import find_model

@@ -14,7 +14,7 @@ from sample_logs import FORWARD, jpeg, rewrite, small_rig, truncate, write_av2_l
 from rtmap_cli.geometry.poses import se3_from_xyyaw, transform
 from rtmap_cli.logs.log import Camera, Frame, Rig
 from rtmap_cli.logs.native import NativeLogWriter
-from rtmap_cli.logs.run import read_run
+from rtmap_cli.logs.run_files import read_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
 from rtmap_cli.steps.infer import MapModel, find_model

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rtmap_cli.logs.run import read_run
+from rtmap_cli.logs.run_files import read_run
 
 OFF_M = 2.2
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from sample_logs import write_native_log
 
-from rtmap_cli.logs.run import read_run
+from rtmap_cli.logs.run_files import read_run
 
 onnx = pytest.importorskip("onnx", reason="onnx is not installed (extra: train)")
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from sample_logs import truncate, write_native_log
 
-from rtmap_cli.logs.run import read_run
+from rtmap_cli.logs.run_files import read_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
 from rtmap_cli.steps.infer.ahead import in_order

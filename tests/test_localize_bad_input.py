@@ -10,7 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 from localize_scenes import CENTRE, CRS, drive, error_of, observed, run_of, straight_road, town
 
-from rtmap_cli.logs.run import Poses, Run, read_poses, write_run
+from rtmap_cli.logs.run import Poses, Run
+from rtmap_cli.logs.run_files import read_poses, write_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
 

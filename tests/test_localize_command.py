@@ -11,7 +11,8 @@ import pytest
 from localize_scenes import CRS, drive, error_of, observed, run_of, straight_road, town
 
 from rtmap_cli.logs.residuals import RESIDUALS
-from rtmap_cli.logs.run import Run, read_poses, write_run
+from rtmap_cli.logs.run import Run
+from rtmap_cli.logs.run_files import read_poses, write_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
 from rtmap_cli.tables import read_table

@@ -11,7 +11,8 @@ import pytest
 from localize_scenes import CENTRE, drive, error_of, observed, run_of, straight_road, town
 
 from rtmap_cli.geometry.poses import se3_from_xyyaw, wrap_angle, xyyaw_of
-from rtmap_cli.logs.run import OUTDATED, Observations, Poses, Run, read_poses, write_run
+from rtmap_cli.logs.run import OUTDATED, Observations, Poses, Run
+from rtmap_cli.logs.run_files import read_poses, write_run
 from rtmap_cli.maps.store import write_new_map
 from rtmap_cli.steps.localize.given import with_prior
 from rtmap_cli.steps.localize.localize import localize

@@ -11,7 +11,8 @@ import pytest
 from localize_scenes import CENTRE, CRS, drive, observed, run_of, town
 
 from rtmap_cli.geometry.poses import se3_from_xyyaw, xyyaw_of, yaw_of
-from rtmap_cli.logs.run import Poses, Run, read_poses, true_poses, write_poses, write_run
+from rtmap_cli.logs.run import Poses, Run, true_poses
+from rtmap_cli.logs.run_files import read_poses, write_poses, write_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
 from rtmap_cli.steps.evaluate.poses import upright_errors

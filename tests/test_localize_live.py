@@ -13,7 +13,8 @@ import pytest
 from localize_scenes import CENTRE, CRS, drive, error_of, observed, run_of, town
 
 from rtmap_cli.geometry.poses import se3_from_xyyaw, xyyaw_of
-from rtmap_cli.logs.run import Poses, Run, read_poses, write_run
+from rtmap_cli.logs.run import Poses, Run
+from rtmap_cli.logs.run_files import read_poses, write_run
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
 from rtmap_cli.steps.localize.drive.motion import motion_of

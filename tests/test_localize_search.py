@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from localize_scenes import drive, error_of, observed, run_of, straight_road, town
 
-from rtmap_cli.logs.run import Run, read_poses, write_run
+from rtmap_cli.logs.run import Run
+from rtmap_cli.logs.run_files import read_poses, write_run
 from rtmap_cli.maps.store import write_new_map
 
 FAR = (8.0, -6.0, np.radians(10.0))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.geometry.polylines import is_ring
 from rtmap_cli.geometry.rings import close, open_ring
-from rtmap_cli.logs.run import write_run
+from rtmap_cli.logs.run_files import write_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.existence import probability
 from rtmap_cli.maps.store import read_map

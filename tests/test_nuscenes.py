@@ -28,7 +28,7 @@ from rtmap_cli.formats.nuscenes.log import NuscenesLog, nuscenes_scenes
 from rtmap_cli.formats.nuscenes.tables import ORIGINS, location_crs
 from rtmap_cli.formats.pickles import read_plain_pickle
 from rtmap_cli.logs.open import open_log
-from rtmap_cli.logs.run import read_run
+from rtmap_cli.logs.run_files import read_run
 from rtmap_cli.maps.crs import is_local, to_lonlat
 from rtmap_cli.maps.store import read_map
 

@@ -15,7 +15,8 @@ from benchmarks.common import places as paper_places
 from benchmarks.common import worlds as paper_worlds
 from benchmarks.paper import printing as paper_print
 from benchmarks.paper import tables as paper_tables
-from rtmap_cli.logs.run import MATCHED, OUTDATED, read_run
+from rtmap_cli.logs.run import MATCHED, OUTDATED
+from rtmap_cli.logs.run_files import read_run
 from rtmap_cli.steps.simulate.driving.routes import Lane
 from rtmap_cli.steps.simulate.worlds.changes import parse_spec
 

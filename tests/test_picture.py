@@ -13,16 +13,8 @@ from sample_logs import FORWARD, jpeg, write_native_log
 from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, transform
 from rtmap_cli.logs.log import Camera, Frame, Rig
 from rtmap_cli.logs.native import NativeLogWriter
-from rtmap_cli.logs.run import (
-    MATCHED,
-    NEW,
-    OUTDATED,
-    Observations,
-    Run,
-    RunFrames,
-    run_info,
-    write_run,
-)
+from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED, Observations, Run, RunFrames, run_info
+from rtmap_cli.logs.run_files import write_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import write_new_map
 from rtmap_cli.steps.picture import (

@@ -174,7 +174,8 @@ def test_same_input_same_bytes(rtmap: Call, ribbon: Path, tmp_path: Path) -> Non
 def test_given_poses_are_used(rtmap: Call, ribbon: Path, tmp_path: Path) -> None:
     from dataclasses import replace
 
-    from rtmap_cli.logs.run import Poses, write_poses
+    from rtmap_cli.logs.run import Poses
+    from rtmap_cli.logs.run_files import write_poses
 
     frames = pq.read_table(ribbon / "frames.parquet").to_pydict()
     pose = np.tile(np.eye(4), (4, 1, 1))

@@ -29,7 +29,8 @@ from rtmap_models.training.checkpoint import start_from
 from training_frames import TINY
 
 from rtmap_cli.cli import run
-from rtmap_cli.logs.run import NEW, read_run
+from rtmap_cli.logs.run import NEW
+from rtmap_cli.logs.run_files import read_run
 from rtmap_cli.logs.semantic import CLASSES, SemanticMap
 from rtmap_cli.maps.store import read_map
 from rtmap_cli.steps.simulate.driving.drive import first_frames

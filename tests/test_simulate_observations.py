@@ -13,7 +13,8 @@ from rtmap_cli.geometry.polylines import is_ring, project
 from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, transform, xyyaw_of
 from rtmap_cli.logs.log import Frame, Occluder
 from rtmap_cli.logs.native import NativeLogWriter
-from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED, Run, read_poses, read_run, true_poses
+from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED, Run, true_poses
+from rtmap_cli.logs.run_files import read_poses, read_run
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import CLASSES, Element, VectorMap
 from rtmap_cli.maps.store import write_new_map

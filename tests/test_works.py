@@ -17,7 +17,8 @@ from rtmap_cli.errors import NoAnswer
 from rtmap_cli.geometry.poses import se3_from_xyyaw
 from rtmap_cli.logs.log import Frame
 from rtmap_cli.logs.native import NativeLogWriter
-from rtmap_cli.logs.run import true_poses, write_poses
+from rtmap_cli.logs.run import true_poses
+from rtmap_cli.logs.run_files import write_poses
 from rtmap_cli.maps.crs import lonlat_to
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import read_map, write_new_map

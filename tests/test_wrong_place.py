@@ -14,7 +14,7 @@ from fusion_scene import drive, line, save, street
 
 from rtmap_cli.formats.changes import read_change_table
 from rtmap_cli.logs.agreement import Agreement, agreement
-from rtmap_cli.logs.run import read_run
+from rtmap_cli.logs.run_files import read_run
 from rtmap_cli.logs.traversal import traversal_of
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.store import read_map, write_new_map

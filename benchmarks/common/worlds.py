@@ -27,16 +27,8 @@ from benchmarks.common.places import (
     shared_frames,
 )
 from rtmap_cli.errors import BadInput, NoAnswer
-from rtmap_cli.logs.run import (
-    MATCHED,
-    OUTDATED,
-    Run,
-    copy_run,
-    read_run,
-    true_poses,
-    write_poses,
-    write_run,
-)
+from rtmap_cli.logs.run import MATCHED, OUTDATED, Run, true_poses
+from rtmap_cli.logs.run_files import copy_run, read_run, write_poses, write_run
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.store import read_map, write_new_map
 from rtmap_cli.steps.evaluate.changes.elements import changed_frames

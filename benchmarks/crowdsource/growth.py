@@ -29,7 +29,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.streets import PERIOD, long_drive, one_period
-from rtmap_cli.logs.run import Run, write_run
+from rtmap_cli.logs.run import Run
+from rtmap_cli.logs.run_files import write_run
 
 DRIVE, ROW, APART = 5.0, 10.0, 1000.0
 """Kilometres of a drive and of a row of them; metres between rows."""

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from benchmarks.common.streets import long_drive, one_period
-from rtmap_cli.logs.run import write_run
+from rtmap_cli.logs.run_files import write_run
 from rtmap_cli.logs.tracks import read_stretch
 from rtmap_cli.logs.traversal import Traversal
 

@@ -29,7 +29,7 @@ import numpy as np
 
 from rtmap_cli.cli import run as rtmap
 from rtmap_cli.formats.geojson import read_geojson
-from rtmap_cli.logs.run import read_run
+from rtmap_cli.logs.run_files import read_run
 from rtmap_cli.maps.element import CLASSES, VectorMap
 from rtmap_cli.maps.store import read_map
 from rtmap_cli.output import plain, table

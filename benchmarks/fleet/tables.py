@@ -32,7 +32,7 @@ from benchmarks.common.printing import Verdict
 from benchmarks.fleet import chain as fleet
 from benchmarks.fleet.maps import PRINT, printed
 from benchmarks.fleet.poses import figures, pose_tables, verdicts
-from rtmap_cli.logs.run import read_run
+from rtmap_cli.logs.run_files import read_run
 from rtmap_cli.output import plain
 from rtmap_cli.steps.evaluate.judge import judge_poses
 from rtmap_cli.steps.evaluate.poses import PoseScore

@@ -34,7 +34,8 @@ from numpy.typing import NDArray
 from benchmarks.common.printing import Verdict, markdown
 from benchmarks.common.streets import long_drive, one_period, street
 from rtmap_cli.geometry.blocks import cells_inside, points_along
-from rtmap_cli.logs.run import Run, write_run
+from rtmap_cli.logs.run import Run
+from rtmap_cli.logs.run_files import write_run
 from rtmap_cli.logs.traversal import Traversal, read_traversals
 from rtmap_cli.maps.element import CLASSES, RING_CLASSES, Element, VectorMap
 from rtmap_cli.maps.store import write_new_map

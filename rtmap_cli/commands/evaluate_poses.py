@@ -40,7 +40,7 @@ def command(
       rtmap evaluate poses runs/drive-00 --truth logs/drive-00
     """
     from rtmap_cli.errors import UsageError
-    from rtmap_cli.logs.run import read_run
+    from rtmap_cli.logs.run_files import read_run
     from rtmap_cli.output import emit
     from rtmap_cli.steps.evaluate.gates.gates import parse_gates
     from rtmap_cli.steps.evaluate.judge import judge_pairs, judge_poses

@@ -86,7 +86,7 @@ def _judge(
     map_version: int | None,
 ) -> dict[str, Any]:
     from rtmap_cli.errors import UsageError
-    from rtmap_cli.logs.run import read_run
+    from rtmap_cli.logs.run_files import read_run
     from rtmap_cli.steps.evaluate.drives import read_drives
     from rtmap_cli.steps.evaluate.uncertainty.judge import judge_map, judge_run
 

@@ -31,7 +31,7 @@ def command(file: Path, output: Path, sigma: float | None, overwrite: bool, as_j
       rtmap import detections drive-00.json.gz -o runs/drive-00
     """
     from rtmap_cli.formats.detections import read_detections
-    from rtmap_cli.logs.run import write_run
+    from rtmap_cli.logs.run_files import write_run
     from rtmap_cli.output import emit
     from rtmap_cli.tables import refuse_existing, whole_folder
 

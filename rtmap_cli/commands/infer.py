@@ -100,7 +100,8 @@ def command(
     from rtmap_cli.errors import UsageError
     from rtmap_cli.logs.agreement import warning
     from rtmap_cli.logs.open import notes_of, open_log
-    from rtmap_cli.logs.run import STATES, write_run
+    from rtmap_cli.logs.run import STATES
+    from rtmap_cli.logs.run_files import write_run
     from rtmap_cli.logs.traversal import traversal_of
     from rtmap_cli.maps.crs import check_same_crs
     from rtmap_cli.maps.store import read_map

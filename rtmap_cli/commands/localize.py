@@ -106,7 +106,7 @@ def command(
       rtmap localize runs/drive-00 --map map --smooth
     """
     from rtmap_cli.logs.residuals import write_residuals
-    from rtmap_cli.logs.run import read_run, read_run_info, write_poses
+    from rtmap_cli.logs.run_files import read_run, read_run_info, write_poses
     from rtmap_cli.maps.crs import check_same_crs
     from rtmap_cli.maps.store import map_crs, read_map
     from rtmap_cli.output import emit, log

@@ -193,7 +193,8 @@ def _of_run(log: Log, frame: Frame, path: Path, threshold: float) -> list[Ground
 
     from rtmap_cli.errors import BadInput
     from rtmap_cli.geometry.poses import invert, se3_from_xyyaw, transform, xyyaw_of
-    from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED, read_run
+    from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED
+    from rtmap_cli.logs.run_files import read_run
     from rtmap_cli.steps.picture import element_lines
 
     run = read_run(path)

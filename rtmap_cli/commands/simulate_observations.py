@@ -131,7 +131,8 @@ def command(
       rtmap simulate observations --map map --log av2:LOG_DIR --preset rtmap-straight \\
           --seed 1 -o runs/one
     """  # fmt: skip
-    from rtmap_cli.logs.run import STATES, write_run
+    from rtmap_cli.logs.run import STATES
+    from rtmap_cli.logs.run_files import write_run
     from rtmap_cli.maps.crs import check_same_crs
     from rtmap_cli.maps.store import read_map
     from rtmap_cli.steps.simulate.driving.drives import thinned, with_traffic
@@ -273,7 +274,7 @@ def _write_truth(truth: Poses, path: Path, crs: str) -> None:
     """The true poses as one file (rtmap.run.poses), whole or not at all."""
     from tempfile import TemporaryDirectory
 
-    from rtmap_cli.logs.run import write_poses
+    from rtmap_cli.logs.run_files import write_poses
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:

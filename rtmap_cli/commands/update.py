@@ -163,7 +163,7 @@ def _classes(
 ) -> list[str]:
     """The classes to update; BadInput when runs and map disagree on what there is."""
     from rtmap_cli.errors import BadInput
-    from rtmap_cli.logs.run import read_run_info
+    from rtmap_cli.logs.run_files import read_run_info
 
     known = {path: [str(c) for c in read_run_info(path)["classes"]] for path in paths}
     first = next(iter(known))

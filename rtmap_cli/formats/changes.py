@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
 from rtmap_cli.formats.features import counter_clockwise, feature, write_features
-from rtmap_cli.logs.run import CHANGES
+from rtmap_cli.logs.run_files import CHANGES
 from rtmap_cli.maps.element import RING_CLASSES
 from rtmap_cli.maps.evidence import Counts, DriveEvidence
 from rtmap_cli.tables import read_table, table_metadata, write_table

@@ -25,16 +25,8 @@ from numpy.typing import NDArray
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.polylines import resample
 from rtmap_cli.geometry.poses import se3_from_xyyaw
-from rtmap_cli.logs.run import (
-    NEW,
-    OCCLUDERS,
-    Observations,
-    Poses,
-    Run,
-    RunFrames,
-    run_info,
-    true_poses,
-)
+from rtmap_cli.logs.run import NEW, Observations, Poses, Run, RunFrames, run_info, true_poses
+from rtmap_cli.logs.run_files import OCCLUDERS
 from rtmap_cli.maps.crs import check_map_crs
 from rtmap_cli.tables import read_json
 

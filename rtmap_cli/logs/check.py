@@ -19,7 +19,7 @@ from rtmap_cli.logs.check_parts import (
 )
 from rtmap_cli.logs.log import Camera, Rig
 from rtmap_cli.logs.native import paths_inside, read_log_info
-from rtmap_cli.logs.run import OCCLUDERS, read_poses
+from rtmap_cli.logs.run_files import OCCLUDERS, read_poses
 from rtmap_cli.logs.tables import (
     FRAMES,
     IMAGES,

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from rtmap_cli import __version__
 from rtmap_cli.errors import BadInput
 from rtmap_cli.logs.log import Frame, Occluder, Rig
-from rtmap_cli.logs.run import OCCLUDERS, Poses, read_poses, write_poses
+from rtmap_cli.logs.run import Poses
+from rtmap_cli.logs.run_files import OCCLUDERS, read_poses, write_poses
 from rtmap_cli.logs.tables import (
     FRAMES,
     IMAGES,

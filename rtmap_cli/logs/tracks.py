@@ -13,15 +13,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from rtmap_cli.errors import BadInput
-from rtmap_cli.logs.run import (
-    OBSERVATIONS,
-    Observations,
-    Run,
-    read_frames,
-    read_poses,
-    read_run,
-    read_run_info,
-)
+from rtmap_cli.logs.run import Observations, Run
+from rtmap_cli.logs.run_files import OBSERVATIONS, read_frames, read_poses, read_run, read_run_info
 from rtmap_cli.logs.traversal import Traversal, range_box, traversal_of, usable_poses
 from rtmap_cli.tables import check_schema
 

@@ -319,7 +319,7 @@ def read_traversals(paths: Sequence[Path], crs: str | None = None) -> tuple[list
     BadInput names the run that is broken, lies in another CRS, has no frame that can be used, or
     is there twice.
     """
-    from rtmap_cli.logs.run import read_run
+    from rtmap_cli.logs.run_files import read_run
     from rtmap_cli.maps.crs import check_map_crs, check_same_crs
 
     out: list[Traversal] = []
@@ -343,6 +343,6 @@ def read_traversals(paths: Sequence[Path], crs: str | None = None) -> tuple[list
 
 def classes_of(paths: Sequence[Path]) -> list[str]:
     """The classes that the models of the runs know, in the order in which they appear."""
-    from rtmap_cli.logs.run import read_run_info
+    from rtmap_cli.logs.run_files import read_run_info
 
     return list(dict.fromkeys(str(c) for p in paths for c in read_run_info(p)["classes"]))

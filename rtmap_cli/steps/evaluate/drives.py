@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.poses import interpolate
 from rtmap_cli.logs.open import READERS
-from rtmap_cli.logs.run import Poses, read_poses, read_run_info
+from rtmap_cli.logs.run import Poses
+from rtmap_cli.logs.run_files import read_poses, read_run_info
 
 Array = NDArray[np.float64]
 

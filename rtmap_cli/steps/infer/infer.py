@@ -20,16 +20,8 @@ from numpy.typing import NDArray
 from rtmap_cli.errors import BadInput, NoAnswer
 from rtmap_cli.geometry.poses import se3_from_xyyaw, wrap_angle, xyyaw_of, yaw_of
 from rtmap_cli.logs.log import Frame, Log
-from rtmap_cli.logs.run import (
-    MATCHED,
-    NEW,
-    OCCLUDERS,
-    OUTDATED,
-    Observations,
-    Run,
-    RunFrames,
-    run_info,
-)
+from rtmap_cli.logs.run import MATCHED, NEW, OUTDATED, Observations, Run, RunFrames, run_info
+from rtmap_cli.logs.run_files import OCCLUDERS
 from rtmap_cli.maps.crop import MapIndex
 from rtmap_cli.maps.element import VectorMap
 from rtmap_cli.maps.prior import PriorSlots, on_prior, prior_slots

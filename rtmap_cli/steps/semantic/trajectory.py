@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from rtmap_cli.errors import BadInput
 from rtmap_cli.geometry.poses import se3_from_xyyaw, wrap_angle, yaw_of
 from rtmap_cli.logs.log import Frame
-from rtmap_cli.logs.run import read_poses
+from rtmap_cli.logs.run_files import read_poses
 
 Array = NDArray[np.float64]
 

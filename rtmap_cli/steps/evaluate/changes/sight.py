@@ -115,7 +115,7 @@ def _boxes(box: Range, occluders: dict[int, Array], whose: str) -> Sight:
 
 
 def _of_run(path: Path) -> Sight:
-    from rtmap_cli.logs.run import read_run
+    from rtmap_cli.logs.run_files import read_run
     from rtmap_cli.logs.traversal import range_box, traversal_of
 
     run = read_run(path)

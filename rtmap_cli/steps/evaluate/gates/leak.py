@@ -117,7 +117,7 @@ def _read_one(spec: str) -> Footprint:
     if path.suffix == ".onnx" or (spec in zoo_models() and not path.exists()):
         return footprint_of_model(find_model(spec))
     if (path / "run.json").exists():
-        from rtmap_cli.logs.run import read_run_info
+        from rtmap_cli.logs.run_files import read_run_info
 
         return footprint_of_run(read_run_info(path), path)
     if path.is_dir() and map_exists(path):
@@ -182,7 +182,7 @@ def check_leak(
 
 
 def _run_info(path: str | Path) -> dict[str, Any] | None:
-    from rtmap_cli.logs.run import read_run_info
+    from rtmap_cli.logs.run_files import read_run_info
 
     return read_run_info(path) if (Path(path) / "run.json").exists() else None
 
@@ -191,7 +191,7 @@ def _area(
     pred: str | Path, truth: str | Path, drives: Sequence[Drive], range_m: Range
 ) -> Area | None:
     """The frames of a run (its initial poses are near enough), else those of the drives."""
-    from rtmap_cli.logs.run import read_frames
+    from rtmap_cli.logs.run_files import read_frames
 
     for path in (pred, truth):
         info = _run_info(path)

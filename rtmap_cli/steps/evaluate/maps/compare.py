@@ -75,7 +75,7 @@ def read_side(
 ) -> Side:
     """A run, a map, a GeoJSON map or a JSON file of frames; ``scored`` for the predictions."""
     from rtmap_cli.formats.map_frames import SUFFIXES, read_map_frames
-    from rtmap_cli.logs.run import read_run
+    from rtmap_cli.logs.run_files import read_run
     from rtmap_cli.maps.store import map_exists, read_map
 
     local = Path(path)

@@ -77,7 +77,7 @@ def evidence_of(folder: Path, crs: str) -> Evidence:
 
 
 def _of_run(folder: Path, crs: str) -> Evidence:
-    from rtmap_cli.logs.run import read_run
+    from rtmap_cli.logs.run_files import read_run
 
     run = read_run(folder)
     check_same_crs(run.crs, crs, folder)

@@ -92,7 +92,7 @@ def _of_cloud(path: Path) -> Track:
 
 
 def _of_run(path: Path) -> Track:
-    from rtmap_cli.logs.run import read_run
+    from rtmap_cli.logs.run_files import read_run
 
     run = read_run(path)
     f = run.frames

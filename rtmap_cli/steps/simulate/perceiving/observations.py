@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from rtmap_cli.errors import NoAnswer
 from rtmap_cli.logs.log import Occluder
-from rtmap_cli.logs.run import OCCLUDERS, Observations, Poses, Run, run_info, true_poses
+from rtmap_cli.logs.run import Observations, Poses, Run, run_info, true_poses
+from rtmap_cli.logs.run_files import OCCLUDERS
 from rtmap_cli.maps.crop import DEFAULT_RANGE, Range
 from rtmap_cli.maps.element import CLASSES, VectorMap
 from rtmap_cli.steps.simulate.driving.drives import Drive, initial_poses
