@@ -62,6 +62,7 @@ COMMANDS: dict[str, Any] = {
             "log": ("map_log", "List the versions of a map."),
             "diff": ("map_diff", "What changed between two versions."),
             "review": ("map_review", "Decide on the changes of a file."),
+            "merge": ("map_merge", "Add what another map of the area knows."),
             "apply": ("map_apply", "Make the accepted changes of a file."),
             "revert": ("map_revert", "Undo one version."),
             "restore": ("map_restore", "Make an old version the newest one."),

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from rtmap_cli.maps.existence import VoteModel, joint_log_likelihoods, log_odds_of
+from rtmap_cli.maps.refit import at_nodes
 from rtmap_cli.maps.registration import registered
 from rtmap_cli.maps.stations import samples_of, stations_of
-from rtmap_cli.steps.crowdsource.lines import _at_nodes, snap_ends
+from rtmap_cli.steps.crowdsource.lines import snap_ends
 
 MODEL = VoteModel()
 
@@ -71,10 +72,10 @@ def test_drives_that_agree_on_a_rarely_seen_place_say_more_than_one_that_picked_
 def test_lines_that_met_in_a_vertex_meet_again() -> None:
     vertices = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 0.0], [20.0, 1.0], [10.0, 0.0]])
     move = np.array([[0.1, 0.1], [0.0, 0.3], [0.0, 0.0], [0.0, 0.2], [0.0, -0.3]])
-    out = _at_nodes(vertices, move, np.ones(5, bool))
+    out = at_nodes(vertices, move, np.ones(5, bool))
     assert np.array_equal(out[1], out[2]) and np.array_equal(out[1], out[4])
     assert np.array_equal(out[[0, 3]], move[[0, 3]])
-    stays = _at_nodes(vertices, move, np.array([True, True, False, False, True]))
+    stays = at_nodes(vertices, move, np.array([True, True, False, False, True]))
     assert np.array_equal(stays[[1, 2, 4]], np.zeros((3, 2)))
 
 

@@ -23,6 +23,9 @@ from rtmap_cli.maps.stations import Stations
 
 Array = NDArray[np.float64]
 
+UNKNOWN_SIGMA = 0.25
+"""Standard deviation (m, each axis) of a prior vertex that states none."""
+
 
 @dataclass(frozen=True)
 class FusionModel:
@@ -87,3 +90,33 @@ def solve_vertices(
     right = np.stack([np.bincount(i, weight * normal[:, a] * o, n) for a in range(2)], axis=-1)
     posterior = np.linalg.inv(matrix + np.linalg.inv(prior))
     return np.einsum("nij,nj->ni", posterior, right), posterior
+
+
+def planar(covariance: Array | None, n: int, unknown: float = UNKNOWN_SIGMA) -> Array:
+    """(n, 2, 2) of a covariance (n, 4: xx, xy, yy, zz); unknown ones become ``unknown``² · I."""
+    out = np.tile(np.eye(2) * unknown**2, (n, 1, 1))
+    if covariance is None:
+        return out
+    known = np.isfinite(covariance[:, :3]).all(axis=1)
+    full = covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    # A singular covariance would make its vertex immovable and its inverse infinite.
+    out[known] = full[known] + np.eye(2) * 1e-6
+    return out
+
+
+def columns(planar_covariance: Array, heights: Array | None) -> Array:
+    """(n, 4) xx, xy, yy, zz from (n, 2, 2) and the zz column of what was before."""
+    zz = np.full(len(planar_covariance), np.nan) if heights is None else heights[:, 3]
+    flat = planar_covariance.reshape(-1, 4)[:, [0, 1, 3]]
+    return np.column_stack([flat, zz])
+
+
+def at_nodes(vertices: Array, move: Array, seen: NDArray[np.bool_]) -> Array:
+    """(n, 2) displacements, the same for all vertices at one place: lines that met in a vertex meet
+    again. Where one of them is not ``seen`` (n,) and stays, they all do."""
+    key = np.round(vertices * 1000).astype(np.int64)
+    _, node, number = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    node = node.ravel()
+    mean = np.stack([np.bincount(node, move[:, k]) / number for k in (0, 1)], axis=-1)
+    mean[np.bincount(node, ~seen) > 0] = 0.0
+    return np.where((number > 1)[node, None], mean[node], move)

@@ -35,7 +35,7 @@ HUBER = 1.5
 
 
 @dataclass(frozen=True)
-class _Votes:
+class Votes:
     """Mean ``offset`` (n,) to the left of a line at ``xy`` (n, 2) with unit ``normal`` (n, 2), and
     its ``variance`` (n,), m²; ``shared`` (n,) variance of the field itself there."""
 
@@ -54,11 +54,11 @@ def registered(samples: Samples, known: Stations) -> Samples:
     if not len(votes.offset):
         return samples
     size = np.maximum(sigma_scale(known, samples) * samples.across_sigma, SMALLEST)
-    moved = samples.xy - _field(votes, samples.xy) * size[:, None]
+    moved = samples.xy - field_at(votes, samples.xy) * size[:, None]
     return replace(samples, xy=moved, last=[])
 
 
-def _votes(samples: Samples, known: Stations) -> _Votes:
+def _votes(samples: Samples, known: Stations) -> Votes:
     """One vote per stretch of a line."""
     feet, _ = assign_once(known, samples)
     sigma = np.maximum(sigma_scale(known, samples) * samples.across_sigma, SMALLEST)[feet.sample]
@@ -72,7 +72,7 @@ def _votes(samples: Samples, known: Stations) -> _Votes:
 
     normal = np.stack([mean(known.normal[feet.station, k]) for k in (0, 1)], axis=-1)
     normal /= np.maximum(np.hypot(*normal.T), 1e-9)[:, None]
-    return _Votes(
+    return Votes(
         np.stack([mean(samples.xy[feet.sample, k]) for k in (0, 1)], axis=-1),
         normal,
         mean(feet.offset / sigma),
@@ -81,30 +81,31 @@ def _votes(samples: Samples, known: Stations) -> _Votes:
     )
 
 
-def _field(votes: _Votes, xy: Array) -> Array:
+def field_at(votes: Votes, xy: Array, width: float = WIDTH) -> Array:
     """(n, 2) displacement at ``xy``: local least squares at nodes with a zero-mean prior, bilinear
-    between them."""
+    between them; ``width``: sigma (m) of the kernel around a node."""
     from scipy.spatial import cKDTree
 
-    corner = np.floor(xy / NODE).astype(np.int64)
-    share = xy / NODE - corner
+    side = width * NODE / WIDTH
+    corner = np.floor(xy / side).astype(np.int64)
+    share = xy / side - corner
     low = corner.min(axis=0)
-    width = int(np.ptp(corner[:, 1])) + 2
-    keys = [(corner[:, 0] - low[0] + i) * width + corner[:, 1] - low[1] + j
+    rows = int(np.ptp(corner[:, 1])) + 2
+    keys = [(corner[:, 0] - low[0] + i) * rows + corner[:, 1] - low[1] + j
             for i in (0, 1) for j in (0, 1)]  # fmt: skip
     nodes, at = np.unique(np.concatenate(keys), return_inverse=True)
-    places = (np.stack(np.divmod(nodes, width), axis=-1) + low) * NODE
+    places = (np.stack(np.divmod(nodes, rows), axis=-1) + low) * side
     near = cKDTree(places).sparse_distance_matrix(
-        cKDTree(votes.xy), 2.5 * WIDTH, output_type="coo_matrix"
+        cKDTree(votes.xy), 2.5 * width, output_type="coo_matrix"
     )
-    value = _solved(votes, near.row, near.col, np.exp(-0.5 * (near.data / WIDTH) ** 2), len(nodes))
+    value = _solved(votes, near.row, near.col, np.exp(-0.5 * (near.data / width) ** 2), len(nodes))
     x, y = share.T
     weight = np.concatenate([(1 - x) * (1 - y), (1 - x) * y, x * (1 - y), x * y])
     parts = (weight[:, None] * value[at]).reshape(4, len(xy), 2)
     return np.asarray(parts.sum(axis=0))
 
 
-def _solved(votes: _Votes, node: Int, vote: Int, kernel: Array, count: int) -> Array:
+def _solved(votes: Votes, node: Int, vote: Int, kernel: Array, count: int) -> Array:
     """(count, 2) field at nodes from pairs of a node and a vote, twice with Huber weights."""
     normal, offset = votes.normal[vote], votes.offset[vote]
     total = np.maximum(np.bincount(node, kernel, count), 1e-9)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.polylines import clip_to_box, length
+from rtmap_cli.geometry.polylines import clip_to_box
 from rtmap_cli.logs.agreement import Agreement, agreement
 from rtmap_cli.logs.tracks import read_stretch
 from rtmap_cli.logs.traversal import Traversal, same_sigma
 from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
+from rtmap_cli.maps.pieces import parts_of, with_covariance
 from rtmap_cli.steps.crowdsource.astray import Astray, find_astray
 from rtmap_cli.steps.crowdsource.fuse import Fusion
 from rtmap_cli.steps.crowdsource.tiling import Box, Region, band_of
@@ -30,8 +30,6 @@ crowdsource meet in the command that gives it."""
 
 SAMPLE = 200
 """Detections of a run that are compared with the prior in each region."""
-SHORTEST = 1.0
-"""Shorter pieces (m) that a cut would leave are dropped."""
 
 
 @dataclass(frozen=True)
@@ -146,29 +144,3 @@ def _cut(element: Element, band: Box | None) -> list[Element]:
     if element.class_name in RING_CLASSES:
         return [element] if _within(element, band) else []
     return parts_of(element, clip_to_box(with_covariance(element), band))
-
-
-def with_covariance(element: Element) -> Array:
-    """(n, 3 or 7) points and covariances side by side, to be cut and interpolated together."""
-    if element.covariance is None:
-        return element.points
-    return np.column_stack([element.points, element.covariance])
-
-
-def parts_of(element: Element, pieces: Sequence[Any]) -> list[Element]:
-    """Elements of pieces (n, 3 or 7) of one; the longest keeps the id."""
-    pieces = [p for p in pieces if len(p) > 1 and length(p) >= SHORTEST]
-    rank = np.argsort([-length(p) for p in pieces], kind="stable")
-    name = element.element_id
-    out = []
-    for k, p in enumerate(pieces):
-        place = int(np.flatnonzero(rank == k)[0])
-        out.append(
-            replace(
-                element,
-                element_id=f"{name}.{place}" if place else name,
-                points=p[:, :3],
-                covariance=p[:, 3:] if p.shape[1] > 3 else None,
-            )
-        )
-    return out

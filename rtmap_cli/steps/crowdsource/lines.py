@@ -11,14 +11,19 @@ from numpy.typing import NDArray
 from rtmap_cli.geometry.polylines import is_ring, tangents
 from rtmap_cli.logs.offsets import fused_offsets
 from rtmap_cli.logs.traversal import Traversal
-from rtmap_cli.maps.refit import FusionModel, solve_vertices
+from rtmap_cli.maps.refit import (
+    UNKNOWN_SIGMA,
+    FusionModel,
+    at_nodes,
+    columns,
+    planar,
+    solve_vertices,
+)
 from rtmap_cli.maps.registration import registered
 from rtmap_cli.maps.stations import Stations, stations_of
 
 Array = NDArray[np.float64]
 
-UNKNOWN_SIGMA = 0.25
-"""Standard deviation (m, each axis) of a prior vertex that states none."""
 NEW_SIGMA = 1.0
 """Standard deviation (m) of a new line's vertices before its detections are fused."""
 END_SIGMA = 0.8
@@ -38,25 +43,6 @@ class Fused:
     points: Array
     covariance: Array | None
     touched: bool
-
-
-def planar(covariance: Array | None, n: int, unknown: float = UNKNOWN_SIGMA) -> Array:
-    """(n, 2, 2) of a covariance (n, 4: xx, xy, yy, zz); unknown ones become ``unknown``² · I."""
-    out = np.tile(np.eye(2) * unknown**2, (n, 1, 1))
-    if covariance is None:
-        return out
-    known = np.isfinite(covariance[:, :3]).all(axis=1)
-    full = covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-    # A singular covariance would make its vertex immovable and its inverse infinite.
-    out[known] = full[known] + np.eye(2) * 1e-6
-    return out
-
-
-def columns(planar_covariance: Array, heights: Array | None) -> Array:
-    """(n, 4) xx, xy, yy, zz from (n, 2, 2) and the zz column of what was before."""
-    zz = np.full(len(planar_covariance), np.nan) if heights is None else heights[:, 3]
-    flat = planar_covariance.reshape(-1, 4)[:, [0, 1, 3]]
-    return np.column_stack([flat, zz])
 
 
 def fuse_lines(
@@ -112,7 +98,7 @@ def fuse_lines(
     seen = [bool(np.isfinite(variance[stations.of_line(k)]).any()) for k in range(len(points))]
     if looked_at is not None:
         seen = [s and looked for s, looked in zip(seen, looked_at, strict=True)]
-    move = _at_nodes(vertices, move, np.repeat(seen, np.diff(start)))
+    move = at_nodes(vertices, move, np.repeat(seen, np.diff(start)))
     out = []
     for k, p in enumerate(points):
         part = slice(start[k], start[k + 1])
@@ -137,17 +123,6 @@ def _without_floor(covariance: Array, floor: float) -> Array:
     size, axes = np.linalg.eigh(covariance)
     size = np.maximum(size - floor**2, size / 2)
     return np.asarray((axes * size[:, None, :]) @ np.swapaxes(axes, -1, -2))
-
-
-def _at_nodes(vertices: Array, move: Array, seen: NDArray[np.bool_]) -> Array:
-    """(n, 2) displacements, the same for all vertices at one place: lines that met in a vertex meet
-    again. Where one of them is not ``seen`` (n,) and stays, they all do."""
-    key = np.round(vertices * 1000).astype(np.int64)
-    _, node, number = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    node = node.ravel()
-    mean = np.stack([np.bincount(node, move[:, k]) / number for k in (0, 1)], axis=-1)
-    mean[np.bincount(node, ~seen) > 0] = 0.0
-    return np.where((number > 1)[node, None], mean[node], move)
 
 
 def _known_along(covariance: Array, xy: Array) -> Array:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from rtmap_cli.geometry.rings import align, close, open_ring, open_rings, simplified
 from rtmap_cli.logs.traversal import Traversal, pose_variance
 from rtmap_cli.maps.consensus import Sightings, consensus
-from rtmap_cli.maps.refit import FusionModel
+from rtmap_cli.maps.refit import FusionModel, columns, planar
 from rtmap_cli.steps.crowdsource.cut_rings import cut_offsets
-from rtmap_cli.steps.crowdsource.lines import LONGEST_MOVE, Fused, columns, planar
+from rtmap_cli.steps.crowdsource.lines import LONGEST_MOVE, Fused
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]

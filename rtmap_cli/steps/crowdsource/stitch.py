@@ -15,12 +15,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from rtmap_cli.geometry.polylines import arc_length, is_ring, length, resample_step, tangents
+from rtmap_cli.geometry.polylines import is_ring, length, resample_step, tangents
 from rtmap_cli.geometry.rings import overlap, polygon
 from rtmap_cli.maps.element import RING_CLASSES, Element, VectorMap
 from rtmap_cli.maps.existence import runs_of
+from rtmap_cli.maps.pieces import GAP, free_id, left_over, own_ends, parts_of, put_onto
 from rtmap_cli.steps.crowdsource.fuse import Fusion
-from rtmap_cli.steps.crowdsource.job import Outcome, parts_of, with_covariance
+from rtmap_cli.steps.crowdsource.job import Outcome
 from rtmap_cli.steps.crowdsource.tiling import BAND
 
 Array = NDArray[np.float64]
@@ -30,8 +31,6 @@ SAME = 0.75
 MIN_COS = 0.8
 STEP = 0.5
 """Where a line is compared with others (m)."""
-GAP = 3.0
-"""Shorter stretches (m) between two that are the same are the same, too; ends within that meet."""
 CENTRE = 3.5
 """Closed elements whose middles are so near (m), or that overlap by `OVERLAP`, are one."""
 OVERLAP = 0.3
@@ -60,22 +59,13 @@ def stitch(prior: VectorMap, outcomes: Sequence[Outcome]) -> Fusion:
     fresh = _new(outcomes)
     taken = {e.element_id for e in elements}
     for e in fresh:
-        named = replace(e, element_id=_free(e.element_id, taken))
+        named = replace(e, element_id=free_id(e.element_id, taken))
         taken.add(named.element_id)
         out.inserted.append(named.element_id)
         elements.append(named)
     out.waiting = [e.element_id for o in outcomes for e in o.waiting]
     out.vector_map = VectorMap(elements, prior.crs)
     return out
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """The id, with a number behind it where it is taken."""
-    free, k = name, 0
-    while free in taken:
-        k += 1
-        free = f"{name}.{k}"
-    return free
 
 
 # ---- prior elements
@@ -171,12 +161,12 @@ def _lines_apart(lines: list[Element], others: list[Element]) -> list[Element]:
     owner: list[int] = []
     cuts: list[tuple[int, int]] = []
     for k, (e, same) in enumerate(zip(lines, common, strict=True)):
-        for piece, *cut in _left_over(e, same) if same.any() else []:
+        for piece, *cut in left_over(e, same) if same.any() else []:
             cuts += [(len(pieces), at) for at, here in zip((0, -1), cut, strict=True) if here]
             pieces.append(piece)
             owner.append(k)
-    for (k, at), end in _own_ends(cuts, pieces, np.array(ends)):
-        pieces[k] = _put_onto(pieces[k], end) if at == 0 else _put_onto(pieces[k][::-1], end)[::-1]
+    for (k, at), end in own_ends(cuts, pieces, np.array(ends)):
+        pieces[k] = put_onto(pieces[k], end) if at == 0 else put_onto(pieces[k][::-1], end)[::-1]
     out = []
     for k, (e, same) in enumerate(zip(lines, common, strict=True)):
         mine = [p for p, o in zip(pieces, owner, strict=True) if o == k and length(p) >= GAP]
@@ -215,62 +205,3 @@ def _in_common(
         if inner and len(run) * STEP < GAP and same.any():
             same[run] = True
     return same
-
-
-def _left_over(element: Element, same: NDArray[np.bool_]) -> list[tuple[Array, bool, bool]]:
-    """The stretches (n, 3 or 7) that are not in common, and whether each was cut at its start and
-    at its end."""
-    table = with_covariance(element)
-    at = arc_length(table)
-    places = np.linspace(0.0, at[-1], len(same))
-    pieces = []
-    for run in runs_of(~same):
-        a, b = places[run[0]], places[run[-1]]
-        if b - a < GAP:
-            continue
-        inside = (at > a + 1e-9) & (at < b - 1e-9)
-        first, last = (
-            np.array([np.interp(x, at, table[:, k]) for k in range(table.shape[1])]) for x in (a, b)
-        )
-        piece = np.concatenate([first[None], table[inside], last[None]])
-        pieces.append((piece, bool(run[0] > 0), bool(run[-1] < len(same) - 1)))
-    return pieces
-
-
-def _own_ends(
-    cuts: Sequence[tuple[int, int]], pieces: Sequence[Array], ends: Array
-) -> list[tuple[tuple[int, int], Array]]:
-    """Of every cut (piece, 0 or -1) the end (3,) that it is put onto, if one is near: each an end
-    of its own where there are as many, so that lines a foot apart keep their order."""
-    if not len(ends) or not cuts:
-        return []
-    from scipy.optimize import linear_sum_assignment
-
-    place = np.array([pieces[k][at, :2] for k, at in cuts])
-    beside = np.array([tangents(pieces[k][:, :2])[at] for k, at in cuts])[:, ::-1] * [-1.0, 1.0]
-    apart = ends[None, :, :2] - place[:, None]
-    far = np.hypot(apart[..., 0], apart[..., 1])
-    # Along the line a cut lies where stations happen to be: what counts is how far beside.
-    cost = (apart * beside[:, None]).sum(axis=-1) ** 2 + 0.01 * far**2
-    cost[far > GAP] = 1e6
-    own = dict(zip(*linear_sum_assignment(cost), strict=True))
-    out = []
-    for k, cut in enumerate(cuts):
-        j = own.get(k)
-        j = int(far[k].argmin()) if j is None or far[k, j] > GAP else j
-        if far[k, j] <= GAP:
-            out.append((cut, ends[j]))
-    return out
-
-
-def _put_onto(piece: Array, end: Array) -> Array:
-    """The piece beginning exactly at an end (3,)."""
-    along = arc_length(piece)
-    ahead = np.array([np.interp(2 * GAP, along, piece[:, k]) for k in (0, 1)]) - piece[0, :2]
-    # Vertices that lie behind that end would make the line turn back.
-    step = piece[1:, :2] - end[:2]
-    onward = (step @ ahead > 0) & (np.hypot(*step.T) > STEP) | (along[1:] > 2 * GAP)
-    start = int(np.argmax(onward)) + 1 if onward.any() else len(piece) - 1
-    head = piece[:1].copy()
-    head[0, :3] = end
-    return np.concatenate([head, piece[start:]])
