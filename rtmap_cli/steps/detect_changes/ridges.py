@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
+FIRM = 6.0
+"""Shorter lines (m) are not extended to a corner."""
 TIP = 3.0
 """Ends side by side, so near (m) and looking the same way, are the tip of an outline."""
 
@@ -292,11 +294,14 @@ def _joins(
     from scipy.spatial import cKDTree
 
     place, outward = _ends(lines)
+    size = [length(line) for line in lines]
     found = []
     for a, b in cKDTree(place).query_pairs(max(gap, 1.5 * corner), output_type="ndarray").tolist():
         if a // 2 == b // 2:
             continue
-        cost = _join_cost(place[a], outward[a], place[b], outward[b], gap, angle, corner)
+        # A speck has no direction that a corner could be told from.
+        turn = corner if min(size[a // 2], size[b // 2]) >= FIRM else 0.0
+        cost = _join_cost(place[a], outward[a], place[b], outward[b], gap, angle, turn)
         if cost is not None:
             found.append((cost[0], a, b, cost[1]))
     return sorted(found, key=lambda j: j[:3])
