@@ -27,7 +27,7 @@ Links = dict[tuple[int, int], "list[_Link]"]
 
 TO_END = 6.0
 """A detection leaves and reaches a line not farther (m) from its end than that."""
-LONGEST = 12.0
+LONGEST = 20.0
 """Longest way (m) between two lines."""
 SHORTEST = 4.0
 """What a detection has of each of the two (m) at least, or a quarter of a short one."""
