@@ -32,6 +32,8 @@ MET = 0.02
 """Ends so near to each other (m) are one vertex."""
 OVERLAP = 0.3
 """A new line that is joined to an end starts so far (m) beyond it."""
+BESIDE = 1.0
+"""An end that lies farther (m) to the side of another one does not continue it."""
 LONGEST_MOVE = 1.0
 """A vertex moves no farther (m) in one fusion: more is a wrong assignment."""
 
@@ -178,8 +180,10 @@ def snap_ends(points: list[Array], new: Sequence[bool], reach: float, angle: flo
         # Where two lines have met already there is no gap to close.
         if owner[a][0] == owner[b][0] or not new[owner[a][0]] or met[b]:
             continue
-        if -(outward[a] @ outward[b]) >= np.cos(angle):
-            options.append((float(np.hypot(*(place[a] - place[b]))), a, b))
+        step = place[a] - place[b]
+        beside = abs(float(outward[b][0] * step[1] - outward[b][1] * step[0]))
+        if -(outward[a] @ outward[b]) >= np.cos(angle) and beside <= BESIDE:
+            options.append((float(np.hypot(*step)), a, b))
     used: set[int] = set()
     for _, a, b in sorted(options):
         if a in used or b in used:
