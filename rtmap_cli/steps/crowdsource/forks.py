@@ -1,7 +1,12 @@
-"""Forks as nodes: where a line ends on another one, that one is cut, and three ends meet."""
+"""Forks as nodes: where a line ends on another one, that one is cut, and three ends meet.
+
+So they do where two lines run on top of each other from their ends before they part: the stretch
+that they have in common is kept once.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,6 +28,16 @@ BASE = 10.0
 FROM_END = 3.0
 """Nearer (m) to the end of a line there is no fork: ends meet there."""
 
+TOGETHER = 0.2
+"""Lines so near (m) to each other from their ends on are one there …"""
+STEM = 4.0
+"""… when that goes on for so far (m) …"""
+PARTED = 0.6
+"""… and they come so far apart (m) …"""
+SOON = 10.0
+"""… within this way (m)."""
+STEP = 0.5
+
 
 @dataclass
 class Branch:
@@ -38,6 +53,7 @@ def forked(lines: Sequence[Branch], may: Sequence[bool]) -> list[Branch]:
     """The lines cut at their forks, parts in order; only lines that ``may`` change are moved or
     cut. Each end is looked at once, in the order of the lines."""
     out = [[line] for line in lines]
+    _share_stems(out, may)
     for k, allowed in enumerate(may):
         for side in (0, -1):
             if not allowed or is_ring(out[k][0].points):
@@ -52,6 +68,58 @@ def forked(lines: Sequence[Branch], may: Sequence[bool]) -> list[Branch]:
             out[line][part : part + 1] = [first, second]
             _end_at(piece, side, second.points[0])
     return [part for parts in out for part in parts]
+
+
+def _share_stems(lines: list[list[Branch]], may: Sequence[bool]) -> None:
+    """What two lines have in common from their ends on is kept by the longer one, which is cut
+    where they part, in place; each line takes part once."""
+    free = [k for k, ok in enumerate(may) if ok and not is_ring(lines[k][0].points)]
+    order = sorted(free, key=lambda k: (-float(arc_length(lines[k][0].points)[-1]), k))
+    done: set[int] = set()
+    for row, k in enumerate(order):
+        for j in order[row + 1 :]:
+            if {k, j} & done:
+                continue
+            for side, other in itertools.product((0, -1), (0, -1)):
+                stem = _stem(lines[k][0].points, side, lines[j][0].points, other)
+                if stem is None:
+                    continue
+                kept, cut = lines[k][0], lines[j][0]
+                along = arc_length(kept.points)[-1]
+                parts = _cut(kept, stem if side == 0 else along - stem)
+                node = parts[0].points[-1]
+                _, _, segment = project(node[None], cut.points)
+                s = arc_length(cut.points)
+                at = s[segment[0]] + np.hypot(*(node[:2] - cut.points[segment[0], :2]))
+                rest = _cut(cut, float(np.clip(at, 1e-6, s[-1] - 1e-6)))[1 if other == 0 else 0]
+                rest.points[0 if other == 0 else -1] = node
+                lines[k], lines[j] = list(parts), [rest]
+                done |= {k, j}
+                break
+
+
+def _stem(a: Array, side: int, b: Array, other: int) -> float | None:
+    """How far (m) from their ends on two lines are one, before they part; None: they are not."""
+    if np.hypot(*(a[side, :2] - b[other, :2])) > PARTED:
+        return None
+    a, b = (x[:, :2] if at == 0 else x[::-1, :2] for x, at in ((a, side), (b, other)))
+    at = arc_length(a)
+    s = np.arange(0.0, min(float(at[-1]), 100.0), STEP)
+    places = np.stack([np.interp(s, at, a[:, i]) for i in (0, 1)], axis=-1)
+    _, apart, _ = project(places, b)
+    near = np.flatnonzero(apart > TOGETHER)
+    # The very ends are what detections are cut at.
+    near = near[s[near] > 1.0]
+    if not len(near) or s[near[0]] < STEM:
+        return None
+    first = int(near[0])
+    wide = np.flatnonzero(apart[first:] > PARTED)
+    if not len(wide) or s[first + wide[0]] - s[first] > SOON:
+        return None
+    last = first + int(wide[0])
+    # Back to where they would be one, as straight as they part.
+    back = apart[first] * (s[last] - s[first]) / max(float(apart[last] - apart[first]), 1e-6)
+    return float(max(s[first] - back, STEM / 2))
 
 
 def _node(
