@@ -49,6 +49,7 @@ from rtmap_cli.steps.detect_changes.rivals import (
     weighed,
     weighed_rings,
 )
+from rtmap_cli.steps.detect_changes.twins import without_twins
 from rtmap_cli.steps.detect_changes.votes import Ballot, ballot, sight_of
 
 Array = NDArray[np.float64]
@@ -132,6 +133,7 @@ def _lines(
             found = cut_beside(found)
         found = joined_lines(bridged(found, old, traversals, samples), name)
         found = part_at_gaps(found, old, samples)
+        found = without_twins(found, old, samples)
     out = [_line_evidence(e, k, stations, votes, settings, now_ns) for k, e in enumerate(prior)]
     # Where a line of the map lies is told by what was seen, not by what the map made of it.
     _add_offsets(out, stations, traversals, seen, fresh, settings)
