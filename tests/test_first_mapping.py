@@ -170,6 +170,30 @@ def test_a_line_is_cut_where_another_one_runs_into_it() -> None:
     assert [p.source for p in kept] == [0, 1]
 
 
+def test_lines_on_top_of_each_other_before_they_part_share_that_stretch() -> None:
+    """Two lines from one end on, a hand apart for 12 m: a stem and two branches."""
+
+    def branch(xy: np.ndarray, source: int) -> Branch:
+        points = np.column_stack([xy, np.full(len(xy), np.nan)])
+        return Branch(points, np.tile([0.01, 0.0, 0.01, np.nan], (len(xy), 1)), source)
+
+    x = np.arange(0.0, 41.0)
+    through = branch(np.stack([x, np.zeros_like(x)], axis=-1), 0)
+    away = np.stack([x[:36], 0.05 + 0.15 * np.maximum(x[:36] - 12.0, 0.0)], axis=-1)
+    for line in (away, away[::-1]):
+        parts = forked([through, branch(line, 1)], [True, True])
+        assert [p.source for p in parts] == [0, 0, 1]
+        node = parts[0].points[-1, :2]
+        assert node == pytest.approx([12.0, 0.0], abs=0.6)
+        assert (node == parts[1].points[0, :2]).all()
+        assert (parts[2].points[[0, -1], :2] == node).all(axis=1).any()
+        assert all(len(p.points) == len(p.covariance) for p in parts)
+    # Two that never part are two, and so are those of which one must not change.
+    beside = branch(np.stack([x, np.full_like(x, 0.1)], axis=-1), 1)
+    assert [p.source for p in forked([through, beside], [True, True])] == [0, 1]
+    assert [p.source for p in forked([through, branch(away, 1)], [False, True])] == [0, 1]
+
+
 def test_a_crossing_that_the_range_always_cuts_is_as_long_as_what_was_seen(
     rtmap: Call, tmp_path: Path
 ) -> None:

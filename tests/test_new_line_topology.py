@@ -17,9 +17,12 @@ from rtmap_cli.geometry.rings import close, open_ring
 from rtmap_cli.logs.run_files import write_run
 from rtmap_cli.maps.element import Element, VectorMap
 from rtmap_cli.maps.existence import probability
+from rtmap_cli.maps.stations import Samples, samples_of
 from rtmap_cli.maps.store import read_map
 from rtmap_cli.steps.crowdsource.cut_rings import cut_offsets
 from rtmap_cli.steps.detect_changes.bridges import _apart, _Runs, cut_beside
+from rtmap_cli.steps.detect_changes.lines import joined_lines
+from rtmap_cli.steps.detect_changes.twins import without_twins
 
 Array = NDArray[np.float64]
 
@@ -148,3 +151,45 @@ def test_a_crossing_that_the_range_cuts_tells_where_it_lies(move: tuple[float, f
     assert not len(cut_offsets(ring[None] + 9.0, window[None], reference, np.array([4.0]))[0])
     low = window - [0.0, 7.0]
     assert not len(cut_offsets(ring[None], low[None], reference, np.array([4.0]))[0])
+
+
+def test_a_side_street_is_not_closed_by_specks() -> None:
+    """Its kerbs end at the border of the range, where noise leaves specks of three metres."""
+    left, right = straight((0.0, 0.0), (0.0, 30.0)), straight((5.0, 0.0), (5.0, 30.0))
+    speck = straight((1.0, 30.5), (4.0, 31.0))
+    kept = joined_lines([left, right, speck], "boundary")
+    assert sorted(len(x) for x in kept) == sorted(len(x) for x in (left, right, speck))
+    # A kerb that long is no speck: its corners are corners.
+    across = straight((1.0, 30.5), (11.0, 31.5))
+    assert len(joined_lines([left, across], "boundary")) == 1
+
+
+def straight(a: tuple[float, float], b: tuple[float, float]) -> Array:
+    """A line with a vertex every half metre."""
+    count = round(float(np.hypot(b[0] - a[0], b[1] - a[1])) * 2) + 1
+    return np.linspace(a, b, count)
+
+
+def seen_as(*offsets: float, frames: int = 12) -> Samples:
+    """Detections of a line from x = 0 to 40 in every frame, one for each offset."""
+    x = np.linspace(0.0, 40.0, 20)
+    parts = []
+    for f in range(frames):
+        for k, y in enumerate(offsets):
+            own = y if len(offsets) > 1 else y * (-1) ** f
+            points = np.stack([x, np.full_like(x, own)], axis=-1)[None]
+            covariance = np.tile(np.eye(2) * 0.09, (1, len(x), 1, 1))
+            found = samples_of(points, covariance, np.array([0.8]), np.array([f]))
+            parts.append(replace(found, detection=found.detection + f * len(offsets) + k))
+    names = ("detection", "xy", "tangent", "spacing", "covariance", "score", "frame")
+    return Samples(*(np.concatenate([getattr(p, n) for p in parts]) for n in names))
+
+
+def test_of_two_lines_where_frames_see_one_one_stays() -> None:
+    twins = [straight((0.0, 0.3), (40.0, 0.3)), straight((0.0, -0.3), (40.0, -0.3))]
+    assert len(without_twins(twins, [], [seen_as(0.3)])) == 1
+    assert len(without_twins(twins, [], [seen_as(0.3, -0.3)])) == 2
+    # A short stretch beside a line may be the tip of something, and few frames tell nothing.
+    short = [twins[0], straight((0.0, -0.3), (6.0, -0.3))]
+    assert len(without_twins(short, [], [seen_as(0.3)])) == 2
+    assert len(without_twins(twins, [], [seen_as(0.3, frames=4)])) == 2

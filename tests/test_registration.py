@@ -86,3 +86,12 @@ def test_a_new_line_that_overlaps_the_end_it_joins_does_not_run_back_and_forth()
     snap_ends(points, [False, True], 3.0, float(np.radians(30)))
     assert np.array_equal(points[1][0, :2], old[-1, :2])
     assert (np.diff(points[1][:, 0]) >= 0).all()
+
+
+def test_an_end_beside_another_one_does_not_continue_it() -> None:
+    """The lane line beside it starts where this one ends: both keep their places."""
+    old = np.column_stack([np.linspace(-10, 0, 6), np.zeros(6), np.zeros(6)])
+    new = np.column_stack([np.linspace(0.5, 20, 40), np.full(40, 2.4), np.zeros(40)])
+    points = [old, new.copy()]
+    snap_ends(points, [False, True], 3.0, float(np.radians(30)))
+    assert np.array_equal(points[1], new)
