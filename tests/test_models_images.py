@@ -43,7 +43,7 @@ from training_frames import tiny_config  # noqa: E402
 
 from rtmap_cli.errors import BadInput  # noqa: E402
 from rtmap_cli.geometry import cameras as numpy_cameras  # noqa: E402
-from rtmap_cli.logs.run import read_run  # noqa: E402
+from rtmap_cli.logs.run_files import read_run  # noqa: E402
 
 BRANCH = "image_width = 8\nimage_heights_m = [0.0, 2.0]\ntilt_sigma = 0.02\n"
 
