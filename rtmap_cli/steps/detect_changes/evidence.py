@@ -128,10 +128,10 @@ def _lines(
             break
         # What is left of the candidates competes once more, without those that were refuted.
         found = _supported(found, len(old), stations, votes, policy)
-        found = joined_lines(found, name)
+        found = joined_lines(found, name, bool(old))
         if name in OUTLINE_CLASSES:
             found = cut_beside(found)
-        found = joined_lines(bridged(found, old, traversals, samples), name)
+        found = joined_lines(bridged(found, old, traversals, samples), name, bool(old))
         found = part_at_gaps(found, old, samples)
         found = without_twins(found, old, samples)
     out = [_line_evidence(e, k, stations, votes, settings, now_ns) for k, e in enumerate(prior)]

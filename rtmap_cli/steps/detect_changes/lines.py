@@ -48,6 +48,9 @@ USUAL_GAP, JOIN_ANGLE = 7.0, float(np.radians(25))
 """Ends of new lines that look at each other are joined over such a gap (m): boundaries go on."""
 CORNER = {"boundary": 5.0}
 """Longest extension (m) of two ends to a common corner."""
+FIRM = 6.0
+"""Where nothing is known shorter lines (m) are not extended to one: specks at the border of the range
+would close side streets. Beside a map what is made of specks is refuted as a whole."""
 
 
 def new_lines(
@@ -75,13 +78,14 @@ def new_lines(
     points = _all_ridge_points(drives, traversals, blur, LOW * steady)
     if points is None:
         return []
-    return joined_lines(trace(points, HIGH * steady, SHORTEST), class_name)
+    return joined_lines(trace(points, HIGH * steady, SHORTEST), class_name, len(prior) > 0)
 
 
-def joined_lines(lines: list[Array], class_name: str) -> list[Array]:
-    """Lines whose ends look at each other, or meet at a corner, made one."""
-    gap = JOIN_GAP.get(class_name, USUAL_GAP)
-    return join_collinear(lines, gap, JOIN_ANGLE, CORNER.get(class_name, 0.0))
+def joined_lines(lines: list[Array], class_name: str, charted: bool = False) -> list[Array]:
+    """Lines whose ends look at each other, or meet at a corner, made one; ``charted``: a map knows
+    others of their class."""
+    gap, corner = JOIN_GAP.get(class_name, USUAL_GAP), CORNER.get(class_name, 0.0)
+    return join_collinear(lines, gap, JOIN_ANGLE, corner, 0.0 if charted else FIRM)
 
 
 def _all_ridge_points(

@@ -18,8 +18,6 @@ Array = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 
-FIRM = 6.0
-"""Shorter lines (m) are not extended to a corner."""
 TIP = 3.0
 """Ends side by side, so near (m) and looking the same way, are the tip of an outline."""
 
@@ -259,16 +257,17 @@ def _ends(lines: list[Array]) -> tuple[Array, Array]:
 
 
 def join_collinear(
-    lines: list[Array], gap: float, angle: float, corner: float = 0.0
+    lines: list[Array], gap: float, angle: float, corner: float = 0.0, firm: float = 0.0
 ) -> list[Array]:
     """Join lines whose ends look at each other: at most ``gap`` m apart, ``angle`` rad off.
 
     With ``corner`` > 0 (m) ends that meet at a corner are extended to where their tangents
-    cross, if that is at most so far from both (boundaries turn sharply at junctions).
+    cross, if that is at most so far from both (boundaries turn sharply at junctions) and both
+    are ``firm`` (m) long.
     """
     lines = list(lines)
     while len(lines) > 1:
-        pairs = _joins(lines, gap, angle, corner)
+        pairs = _joins(lines, gap, angle, corner, firm)
         if not pairs:
             break
         used: set[int] = set()
@@ -287,7 +286,7 @@ def join_collinear(
 
 
 def _joins(
-    lines: list[Array], gap: float, angle: float, corner: float
+    lines: list[Array], gap: float, angle: float, corner: float, firm: float
 ) -> list[tuple[float, int, int, Array | None]]:
     """Possible joins, cheapest first: cost, the two ends (2 · line, + 1 for its last point), and
     the corner between them or None."""
@@ -299,8 +298,7 @@ def _joins(
     for a, b in cKDTree(place).query_pairs(max(gap, 1.5 * corner), output_type="ndarray").tolist():
         if a // 2 == b // 2:
             continue
-        # A speck has no direction that a corner could be told from.
-        turn = corner if min(size[a // 2], size[b // 2]) >= FIRM else 0.0
+        turn = corner if min(size[a // 2], size[b // 2]) >= firm else 0.0
         cost = _join_cost(place[a], outward[a], place[b], outward[b], gap, angle, turn)
         if cost is not None:
             found.append((cost[0], a, b, cost[1]))
