@@ -49,8 +49,8 @@ USUAL_GAP, JOIN_ANGLE = 7.0, float(np.radians(25))
 CORNER = {"boundary": 5.0}
 """Longest extension (m) of two ends to a common corner."""
 FIRM = 6.0
-"""Where nothing is known shorter lines (m) are not extended to one: specks at the border of the range
-would close side streets. Beside a map what is made of specks is refuted as a whole."""
+"""Where nothing is known shorter lines (m) are not extended to one: specks at the border of the
+range would close side streets. Beside a map what is made of specks is refuted as a whole."""
 
 
 def new_lines(
