@@ -16,16 +16,20 @@ cv2 = pytest.importorskip("cv2", reason="opencv is not installed (extra: train)"
 
 import onnx  # noqa: E402
 import onnxruntime  # noqa: E402
+from rtmap_models.answer import hints  # noqa: E402
 from rtmap_models.bev import normalize_picture  # noqa: E402
 from rtmap_models.config import load_config  # noqa: E402
 from rtmap_models.data.dataset import Frames, collate, make_sample  # noqa: E402
+from rtmap_models.export import onnx_weights  # noqa: E402
 from rtmap_models.export.onnx_file import OUTPUTS, example_inputs, parity  # noqa: E402
 from rtmap_models.tiny.criterion import LossWeights, compute_losses  # noqa: E402
+from rtmap_models.tiny.decoder import LayerOutput  # noqa: E402
 from rtmap_models.tiny.matcher import Matcher  # noqa: E402
 from rtmap_models.tiny.network import RTMapNet  # noqa: E402
 from rtmap_models.training.calibrate import calibrate  # noqa: E402
 from rtmap_models.training.checkpoint import load_network  # noqa: E402
 from rtmap_models.training.recipe import Recipe  # noqa: E402
+from rtmap_models.training.scores import fit_scores  # noqa: E402
 from rtmap_models.training.train import TrainOptions, train  # noqa: E402
 from training_frames import painted_frames, tiny_config  # noqa: E402
 
@@ -131,6 +135,66 @@ def test_export_describes_itself(model: Path) -> None:
     assert {node.domain for node in graph.graph.node} == {""}
     raw = model.read_bytes()
     assert str(Path(__file__).parents[1]).encode() not in raw and b"site-packages" not in raw
+
+
+def test_an_exported_model_is_calibrated_again(
+    rtmap, model: Path, frames: Path, tmp_path: Path
+) -> None:
+    again = tmp_path / "again.onnx"
+    told = rtmap("export-model", model, "-o", again, "--calibrate", frames, "--json")
+    factors = json.loads(told.out)["calibration"]
+    one, two = (onnx_weights.read_weights(p) for p in (model, again))
+    assert one is not None and two is not None
+    changed = {name for name in one if not torch.equal(one[name], two[name])}
+    assert changed == {"sigma_factor", "pose.inflation"}
+    meta = onnx_weights.read_metadata(again)
+    assert json.loads(meta["rtmap.calibration"]).keys() == factors.keys()
+    before = onnx_weights.read_metadata(model)
+    for key in ("rtmap.training", "rtmap.training_footprint", "rtmap.training_data"):
+        assert meta[key] == before[key]
+    # What the graph answers is what the weights of the hints make of it.
+    network, _ = load_network(again)
+    for mode in range(2):
+        for c, name in enumerate(network.config.classes):
+            fit = factors[f"score {name} {'with' if mode else 'without'} prior"]
+            network.score_fit[mode, c] = torch.tensor(fit)
+    assert not torch.allclose(network.score_fit, load_network(again)[0].score_fit)
+    assert max(parity(network, again, ((1, 2, 3),)).values()) < 1e-3
+    assert parity(load_network(model)[0], again, ((1, 2, 3),))["scores"] > 1e-3
+    # A model that cannot give its weights back says so.
+    assert "holds no weights" in rtmap(
+        "export-model", _stripped(model, tmp_path / "s.onnx"), "-o", tmp_path / "x.onnx", code=3
+    ).err  # fmt: skip
+    assert "no such model" in rtmap("export-model", "none", "-o", tmp_path / "x.onnx", code=3).err
+
+
+def _stripped(model: Path, path: Path) -> Path:
+    content = onnx.load(model)
+    del content.training_info[:]
+    onnx.save(content, path)
+    return path
+
+
+def test_scores_are_fitted_to_what_was_right() -> None:
+    rng, true = np.random.default_rng(0), np.array([0.7, 1.5, -0.4, 0.3])
+    x = np.column_stack([rng.normal(0, 1.5, (20_000, 3)), np.ones(20_000)])
+    right = rng.random(len(x)) < 1 / (1 + np.exp(-x @ true))
+    assert fit_scores(np.column_stack([x, right])) == pytest.approx(true, abs=0.08)
+    # Nothing right at all: scores fall, and do so within bounds.
+    none = fit_scores(np.column_stack([x[:50], np.zeros(50)]))
+    assert np.isfinite(none).all() and none[0] > 0 and (x[:50] @ none).mean() < -1
+
+
+def test_hints_are_logit_sharpness_and_length() -> None:
+    points = torch.zeros(1, 3, 5, 2)
+    points[0, 0, :, 0] = torch.linspace(0, 8, 5)
+    scale = torch.full((1, 3, 5, 2), -1.5)
+    logits = torch.arange(12.0).reshape(1, 3, 4)
+    got = hints(LayerOutput(points, scale, logits), new_count=2, classes=3)
+    assert got.shape == (1, 2, 3, 4)
+    assert torch.equal(got[0, 1, :, 0], torch.tensor([4.0, 5.0, 6.0]))
+    assert torch.allclose(got[..., 1], torch.tensor(1.5)) and (got[..., 3] == 1).all()
+    assert torch.allclose(got[0, :, 0, 2], torch.tensor([9.0, 1.0]).log(), atol=1e-3)
 
 
 def test_export_refuses_to_overwrite(rtmap, model: Path, weights: Path) -> None:

@@ -43,21 +43,21 @@ class AnsweringNet(nn.Module):
     """What all networks share: honest scales and scores, closed rings, the pose.
 
     ``sigma_factor`` (C, 2) is measured after training: what the Laplace scale of each class (new,
-    prior) must be multiplied with to be honest. So is ``score_line`` (2, C, 2): per mode (without,
-    with a prior) and class the slope and offset that make the logits of new queries probabilities.
+    prior) must be multiplied with to be honest. So is ``score_fit`` (2, C, 4): per mode (without,
+    with a prior) and class what makes the `hints` of a new query the logit of a probability.
     """
 
     sigma_factor: Tensor
-    score_line: Tensor
+    score_fit: Tensor
 
     def __init__(self, config: ModelConfig):
         super().__init__()
         self.config = config
         self.pose = PoseHead()
         self.register_buffer("sigma_factor", torch.ones(len(config.classes), 2))
-        line = torch.tensor([1.0, 0.0]).repeat(2, len(config.classes), 1)
+        fit = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(2, len(config.classes), 1)
         # Not kept with the weights: measured anew for every export.
-        self.register_buffer("score_line", line, persistent=False)
+        self.register_buffer("score_fit", fit, persistent=False)
 
     def predict_batch(self, batch: Batch, bf16: bool = False) -> Layers:
         """All layers on a training batch; convolutions in bfloat16 where that is asked for."""
@@ -77,8 +77,8 @@ class AnsweringNet(nn.Module):
         one_hot = F.one_hot(prior_class.clamp(0, classes - 1), classes).float()
         exists = last.logits[:, n:, classes].sigmoid() * used
         aided = (used.sum(dim=1) > 0).long()
-        line = self.score_line[aided][:, None]  # (B, 1, C, 2)
-        new_scores = (last.logits[:, :n, :classes] * line[..., 0] + line[..., 1]).sigmoid()
+        fit = self.score_fit[aided][:, None]  # (B, 1, C, 4)
+        new_scores = (hints(last, n, classes) * fit).sum(dim=-1).sigmoid()
         scores = torch.cat([new_scores, one_hot * exists[..., None]], dim=1)
         best = torch.cat([new_scores.argmax(-1), prior_class.clamp(0, classes - 1)], dim=1)
         points = self._close(last.points, best)
@@ -104,6 +104,21 @@ class AnsweringNet(nn.Module):
         factor = self.sigma_factor[class_id]  # (B, Q, 2): new, prior
         new, prior = factor[:, :new_count, 0], factor[:, new_count:, 1]
         return torch.cat([new, prior], dim=1)[..., None, None]
+
+
+def hints(last: LayerOutput, new_count: int, classes: int) -> Tensor:
+    """(B, n, C, 4): what tells whether a new query is right: its logit of each class, how sharply
+    it is placed (minus the mean log of its scales), the log of 1 m and its length, and one.
+
+    A network is often sure where a line lies before it dares to say that there is one.
+    """
+    logits = last.logits[:, :new_count, :classes]
+    sharp = -last.log_scale[:, :new_count].mean(dim=(2, 3))
+    step = last.points[:, :new_count, 1:] - last.points[:, :new_count, :-1]
+    size = step.square().sum(dim=-1).clamp(min=1e-8).sqrt().sum(dim=-1)
+    beside = torch.stack([sharp, (1.0 + size).log(), torch.ones_like(sharp)], dim=-1)
+    beside = beside[:, :, None].expand(-1, -1, classes, -1)
+    return torch.cat([logits[..., None], beside], dim=-1)
 
 
 def laplace_sigma(scale: Tensor) -> Tensor:

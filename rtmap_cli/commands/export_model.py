@@ -57,7 +57,8 @@ def command(
     as_json: bool,
     overwrite: bool,
 ) -> None:
-    """Export WEIGHTS of `rtmap train` to one ONNX file and check it against torch.
+    """Export WEIGHTS of `rtmap train` (or of an exported model, to calibrate it again) to one ONNX
+    file and check it against torch.
 
     Standard operators only; batch, cameras and prior slots are dynamic; the metadata says the
     rest. The file is compared with torch on every execution provider of onnxruntime at two sizes;

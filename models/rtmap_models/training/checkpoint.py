@@ -57,7 +57,12 @@ def load_resumable(path: Path, config: ModelConfig) -> dict[str, Any]:
 
 
 def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
-    """The averaged network of a checkpoint in evaluation mode, and the checkpoint's content."""
+    """A network in evaluation mode and what is known of its training: the averaged weights of a
+    checkpoint with its content, or those that an ONNX file of ``rtmap export-model`` (also a model
+    of the zoo, by its name) was made of, with what its metadata say."""
+    path = _weights_file(str(path))
+    if path.suffix == ".onnx":
+        return _network_of_export(path)
     config, content = load_checkpoint(path)
     network = build_network(config)
     try:
@@ -65,6 +70,23 @@ def load_network(path: Path) -> tuple[Any, dict[str, Any]]:
     except (KeyError, RuntimeError) as error:
         raise BadInput(path, "the weights do not fit the configuration", "train again") from error
     return network.eval(), content
+
+
+def _network_of_export(path: Path) -> tuple[Any, dict[str, Any]]:
+    from rtmap_models.export.onnx_weights import read_metadata
+
+    state = _read_state(path)
+    network = build_network(config_to_train(None, str(path)))
+    network.load_state_dict(state)
+    text = read_metadata(path).get("rtmap.training", "null")
+    try:
+        known = json.loads(text)
+        numbers = {k: known[k] for k in ("step", "samples", "frames", "seconds")}
+    except (ValueError, TypeError, KeyError) as error:
+        raise BadInput(
+            path, f"does not say how it was trained ({error})", "give the checkpoint"
+        ) from error
+    return network.eval(), numbers | {"footprint": footprint_of_source(str(path)).as_json()}
 
 
 def start_from(network: nn.Module, source: str, partial: bool = False) -> list[str]:
