@@ -133,37 +133,83 @@ def _pieces(
     if not evidence.in_view:
         out.untouched.append(element.element_id)
         return [_Piece(element, False, False)]
-    kept: list[Stretch] = []
-    gone: list[Stretch] = []
-    for stretch in evidence.stretches:
-        absent = not stretch.exists and _deletable(element, stretch, policy)
-        (gone if absent else kept).append(stretch)
-    if gone:
-        out.deleted.append(element.element_id)
-    if not kept:
-        return []
-    whole = len(kept) == 1 and not gone
-    if whole:
+    absent = [not s.exists and _deletable(element, s, policy) for s in evidence.stretches]
+    doubted = [not s.exists and _unlikely(s, policy) for s in evidence.stretches]
+    if not any(absent) and (not any(doubted) or len(doubted) == 1):
         odds = before + evidence.likelihood_ratio
         return [
             _Piece(_updated(element, odds, evidence.counts), False, True, element.traversals > 0)
         ]
+    if any(absent):
+        out.deleted.append(element.element_id)
+    kept = _kept(evidence.stretches, absent, doubted, is_ring(element.points))
+    if not kept:
+        return []
     out.split.append(element.element_id)
     return _split(element, kept, before)
+
+
+def _kept(
+    stretches: list[Stretch], absent: list[bool], doubted: list[bool], ring: bool
+) -> list[Stretch]:
+    """What stays of an element: what is ``doubted`` without being ``absent`` on its own, so that
+    the map remembers the doubt, and meeting what is beside it; all else in one piece."""
+    groups: list[list[Stretch]] = []
+    follows: list[bool] = []
+    for k, stretch in enumerate(stretches):
+        if absent[k]:
+            continue
+        beside = k > 0 and not absent[k - 1]
+        if beside and not (doubted[k] or doubted[k - 1]):
+            groups[-1].append(stretch)
+        else:
+            groups.append([stretch])
+            follows.append(beside)
+    if ring and len(groups) > 1 and not (absent[0] or absent[-1]):
+        if doubted[0] or doubted[-1]:
+            follows[0] = True
+        else:
+            groups[0], follows[0] = groups.pop() + groups[0], follows.pop()
+    out = [_one(g) for g in groups]
+    for k, met in enumerate(follows):
+        if met:
+            both = [out[k - 1].geometry, out[k].geometry[:1]]
+            out[k - 1] = replace(out[k - 1], geometry=np.concatenate(both))
+    return out
+
+
+def _one(parts: list[Stretch]) -> Stretch:
+    """Stretches that follow each other as one: their evidence by length, counts of the longest."""
+    size = np.array([length(p.geometry) for p in parts])
+    share = size / size.sum()
+    return replace(
+        parts[int(size.argmax())],
+        exists=True,
+        log_odds=float(sum(w * p.log_odds for w, p in zip(share, parts, strict=True))),
+        likelihood_ratio=float(
+            sum(w * p.likelihood_ratio for w, p in zip(share, parts, strict=True))
+        ),
+        geometry=np.concatenate([p.geometry for p in parts]),
+        start=parts[0].start,
+        stop=parts[-1].stop,
+    )
 
 
 def _deletable(element: Element, stretch: Stretch, policy: Policy) -> bool:
     """Improbable, enough drives had a look at it (those of earlier fusions included), and k of the
     newest n missed it."""
     looked = element.traversals + stretch.counts.traversals_in_view
-    unlikely = float(probability(stretch.log_odds)) < policy.delete_below
     found, of = stretch.counts.newest(policy.delete_of)
     # Of drives fused before, the map knows how many there were and which found it, not their order.
     room = policy.delete_of - of if policy.delete_of else element.traversals
     before = min(element.traversals, room)
     missed_before = min(max(element.traversals - len(element.runs), 0), before)
     missed = of - found + missed_before >= min(policy.delete_traversals, of + before)
-    return unlikely and looked >= policy.delete_traversals and missed
+    return _unlikely(stretch, policy) and looked >= policy.delete_traversals and missed
+
+
+def _unlikely(stretch: Stretch, policy: Policy) -> bool:
+    return float(probability(stretch.log_odds)) < policy.delete_below
 
 
 def _split(element: Element, kept: list[Stretch], before: float) -> list[_Piece]:

@@ -35,6 +35,7 @@ from rtmap_cli.maps.stations import GATE, MIN_COS, Samples, Stations, stations_o
 from rtmap_cli.steps.detect_changes.bridges import bridged, cut_beside
 from rtmap_cli.steps.detect_changes.crossings import class_rings, new_rings, ring_counts
 from rtmap_cli.steps.detect_changes.doubles import split_doubles
+from rtmap_cli.steps.detect_changes.folds import folds, shared
 from rtmap_cli.steps.detect_changes.gaps import part_at_gaps
 from rtmap_cli.steps.detect_changes.lines import (
     all_line_counts,
@@ -166,7 +167,9 @@ def _line_votes(
     # Lines that are all new part best by what is nearest; known ones may be seen farther off.
     full = all_line_counts(*drives, wide=old > 0)
     history = _history(prior)[:, stations.line[:before]]
-    votes = ballot(full.counts, traversals, settings.votes, fresh, before, APART, history)
+    across = folds(stations, before)
+    counts = [shared(c, across) for c in full.counts]
+    votes = ballot(counts, traversals, settings.votes, fresh, before, APART, history)
     picked = np.arange(len(stations)) >= before
     pairs = neighbours(stations)
     doubtful = questioned(votes, pairs, before)
